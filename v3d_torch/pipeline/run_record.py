@@ -170,9 +170,9 @@ class StateTable(TensorTable):
         )
 
     @property
-    def statuses(self) -> list[str]:
+    def statuses(self) -> list[TrackingStatus]:
         """Status of each frame when it was tracked."""
-        return [_STATUSES[code].value for code in self["status"].tolist()]
+        return [_STATUSES[code] for code in self["status"].tolist()]
 
 
 class LiveTable(TensorTable):

@@ -5,8 +5,11 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+from v3d_torch.datasets.base import LiveStream
 from v3d_torch.errors import OutputError
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import CHECKPOINT, FileSizes, write_checkpoint
@@ -18,7 +21,8 @@ _LOG = logging.getLogger(__name__)
 class Autosave:
     """Saves results and checkpoints at the intervals of the configuration.
 
-    If they cannot be written, the run continues, with the reason in ``record.save_error``.
+    Files of a live run are written in a thread, because frames are lost while tracking waits. If files cannot be
+    written, the run continues, with the reason in ``record.save_error``.
 
     Args:
         folder: Folder of the results.
@@ -33,27 +37,33 @@ class Autosave:
         self._sizes = FileSizes(pipeline.sequence)
         self._config = pipeline.slam.config.checkpoint
         self._due = time.perf_counter() + self._config.interval
+        self._thread: ThreadPoolExecutor | None = None
+        self._saved: Future[None] | None = None
+        if isinstance(pipeline.sequence, LiveStream):
+            _import_writer()  # takes a second, in which a camera that has started would lose frames
+            self._thread = ThreadPoolExecutor(1, "autosave")
 
     def __call__(self) -> None:
         """Save after a frame, if a save is due."""
         start = time.perf_counter()
         if start < self._due:
             return
-        from v3d_torch.runs.results import write_intermediate_results  # pyarrow would delay the first frame
-
-        try:
-            write_intermediate_results(self._folder, self._pipeline)
-            self._write_checkpoint()
-        except OutputError as error:
-            self._report(error)
-        end = time.perf_counter()
-        self._due = end + max(self._config.interval, (end - start) * (1 / self._config.max_time_fraction - 1))
+        self._due = math.inf  # until the files are written
+        write = _import_writer()(self._folder, self._pipeline)
+        if self._thread is None:
+            self._save(write, start)
+        else:
+            if self._saved is not None:
+                self._saved.result()  # an error of the program ends the run
+            self._saved = self._thread.submit(self._save, write, start)
 
     def end(self) -> None:
         """Save a last checkpoint if the run ended early between two frames, before the results are written.
 
         If the run ended within a frame, the last checkpoint stays: the state within a frame is not consistent.
         """
+        if self._saved is not None and (error := self._saved.exception()) is not None:  # waits for the thread
+            _LOG.error("autosave failed", exc_info=error)
         record = self._pipeline.record
         if (
             record.failure is None
@@ -72,6 +82,16 @@ class Autosave:
         if self._pipeline.record.failure is None:
             (self._folder / CHECKPOINT).unlink(missing_ok=True)
 
+    def _save(self, write: Callable[[], None], start: float) -> None:
+        """Write results and checkpoint, and set the time of the next ones."""
+        try:
+            write()
+            self._write_checkpoint()
+        except OutputError as error:
+            self._report(error)
+        end = time.perf_counter()
+        self._due = end + max(self._config.interval, (end - start) * (1 / self._config.max_time_fraction - 1))
+
     def _write_checkpoint(self) -> None:
         if self._request is None:
             return
@@ -84,3 +104,10 @@ class Autosave:
         if self._pipeline.record.save_error != str(error):
             _LOG.warning("no checkpoint: %s", error)
         self._pipeline.record.save_error = str(error)
+
+
+def _import_writer() -> Callable[[Path, Pipeline], Callable[[], None]]:
+    """Import the writer of results, whose libraries would delay the first frame."""
+    from v3d_torch.runs.results import prepare_intermediate_results
+
+    return prepare_intermediate_results

@@ -2,43 +2,33 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 import platform
 import re
 import sys
-from collections.abc import Sized
-from contextlib import suppress
+from collections.abc import Callable, Sized
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 
-from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets.tum_extents import describe_difference
-from v3d_torch.datasets.tum_trajectory import write_trajectory
-from v3d_torch.errors import InputError
-from v3d_torch.evaluation import Evaluation, evaluate
+from v3d_torch.evaluation import Evaluation
 from v3d_torch.geometry.se3 import invert
-from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.io.files import write_text
 from v3d_torch.io.ply import write_ply
 from v3d_torch.mapping.keyframe import stack_poses
-from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.occupancy.map_server import write_map_server_files
 from v3d_torch.occupancy.occupancy_grid import occupancy_grid
 from v3d_torch.occupancy.occupancy_io import save_occupancy
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
-from v3d_torch.runs.state_table import make_state_table
-from v3d_torch.segmentation.coco import class_name
+from v3d_torch.runs.result_tables import collect_tables
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
 from v3d_torch.viz.run_figures import draw_run
@@ -49,29 +39,6 @@ if sys.platform != "win32":
 _LOG = logging.getLogger(__name__)
 
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
-
-_STATE_COLUMNS = (
-    *("vx", "vy", "vz", "position_sigma", "velocity_sigma"),
-    *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
-)
-"""Columns of velocity, uncertainty and box of an object."""
-
-_DYNAMICS = pa.schema(
-    [
-        ("frame", pa.int64()),
-        ("stamp", pa.float64()),
-        ("id", pa.int64()),
-        ("class", pa.string()),
-        ("x", pa.float64()),
-        ("y", pa.float64()),
-        ("z", pa.float64()),
-        *((name, pa.float64()) for name in _STATE_COLUMNS),
-        ("votes", pa.int64()),
-        ("chamfer", pa.float64()),
-        ("motion_state", pa.string()),
-        ("missed", pa.bool_()),
-    ]
-)
 
 
 def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Evaluation | None:
@@ -88,11 +55,12 @@ def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Eval
     Raises:
         OutputError: If the folder cannot be written or the disk is full.
     """
-    trajectory, evaluation = _write_tables(folder, pipeline)
-    _write_maps(folder, pipeline, trajectory, point_map)
-    draw_run(folder / "figures", pipeline, trajectory, point_map)
-    _write_metrics(folder, pipeline, evaluation, pipeline.record.failure)
-    return evaluation
+    tables = collect_tables(pipeline)
+    tables.write(folder)
+    _write_maps(folder, pipeline, tables.trajectory, point_map)
+    draw_run(folder / "figures", pipeline, tables.trajectory, point_map)
+    _write_metrics(folder, _metrics(pipeline, tables.evaluation, pipeline.record.failure))
+    return tables.evaluation
 
 
 def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
@@ -105,81 +73,35 @@ def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
     Raises:
         OutputError: If the folder cannot be written or the disk is full.
     """
-    _, evaluation = _write_tables(folder, pipeline)
+    prepare_intermediate_results(folder, pipeline)()
+
+
+def prepare_intermediate_results(folder: Path, pipeline: Pipeline) -> Callable[[], None]:
+    """Collect what `write_intermediate_results` writes.
+
+    Args:
+        folder: Folder of the results; made if it is missing.
+        pipeline: Pipeline between two frames.
+
+    Returns:
+        Function that writes the results and raises `OutputError`. It takes seconds after a long run; the pipeline can
+        continue meanwhile in another thread.
+    """
+    tables = collect_tables(pipeline)
     done = len(pipeline.slam.poses)
     total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
-    _write_metrics(folder, pipeline, evaluation, f"killed or still running after {done}{total} frames")
+    failure = f"killed or still running after {done}{total} frames"
+    metrics = _metrics(pipeline, tables.evaluation, failure)
+
+    def write() -> None:
+        tables.write(folder)
+        _write_metrics(folder, metrics)
+
+    return write
 
 
-def _write_tables(folder: Path, pipeline: Pipeline) -> tuple[Trajectory, Evaluation | None]:
-    """Write poses and tables of all frames so far; return the trajectory, and the scores if there is ground truth."""
-    slam, sequence = pipeline.slam, pipeline.sequence
-    trajectory = slam.poses.trajectory()
-    write_trajectory(folder / "trajectory.txt", trajectory)  # first, in case the disk gets full
-    write_text(folder / "config.yaml", dump_config(slam.config))
-    keyframes = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
-    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-    write_trajectory(folder / "keyframes.txt", Trajectory(stamps, invert(stack_poses(keyframes))))
-    evaluation = None
-    if sequence.groundtruth is not None:
-        write_trajectory(folder / "groundtruth.txt", sequence.groundtruth)
-        with suppress(InputError):  # too few poses for scores
-            evaluation = evaluate(sequence.groundtruth, trajectory, frames=pipeline.frame_count)
-    _write_table(folder / "frames.parquet", _frame_table(pipeline))
-    _write_table(folder / "states.parquet", make_state_table(pipeline.record))
-    _write_table(folder / "dynamics.parquet", _object_table(pipeline.record.dynamics))
-    return trajectory, evaluation
-
-
-def _write_metrics(folder: Path, pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> None:
-    write_text(folder / "metrics.json", json.dumps(_metrics(pipeline, evaluation, failure), indent=2) + "\n")
-
-
-def _frame_table(pipeline: Pipeline) -> pa.Table:
-    """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
-    slam, times = pipeline.slam, pipeline.record.times
-    keyframes = torch.tensor([keyframe.frame for keyframe in slam.map.active_keyframes], dtype=torch.int64)
-    statuses = [status.value for status in slam.poses.statuses][: len(times)]  # one more if a frame was interrupted
-    wall, cpu = times.wall.T.numpy(), times.cpu.T.numpy()
-    columns = {
-        "frame": times.indices.numpy(),
-        "stamp": times.stamps.numpy(),
-        "status": pa.array(statuses, pa.string()),
-        "keyframe": torch.isin(times.indices, keyframes).numpy(),
-        **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
-        **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
-    }
-    return pa.table(columns)
-
-
-def _object_table(dynamics: ObjectTable) -> pa.Table:
-    """Return the table of objects: one row per frame and object."""
-    x, y, z = dynamics["centroid"].T
-    state = torch.cat([dynamics["velocity"], dynamics["sigmas"], dynamics["box"]], dim=1)
-    states = [state.value for state in MotionState]
-    columns = {
-        "frame": dynamics["frame"],
-        "stamp": dynamics["stamp"],
-        "id": dynamics["id"],
-        "class": [class_name(label) for label in dynamics["label"].tolist()],
-        "x": x,
-        "y": y,
-        "z": z,
-        **dict(zip(_STATE_COLUMNS, state.T, strict=True)),
-        "votes": dynamics["votes"],
-        "chamfer": dynamics["chamfer"],
-        "motion_state": [states[code] for code in dynamics["motion_state"].tolist()],
-        "missed": dynamics["missed"],
-    }
-    arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
-    return pa.table(arrays, schema=_DYNAMICS)
-
-
-def _write_table(path: Path, table: pa.Table) -> None:
-    content = io.BytesIO()  # so that Python, and not pyarrow, writes the file and raises the errors
-    pq.write_table(table, content)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content.getvalue())
+def _write_metrics(folder: Path, metrics: dict[str, object]) -> None:
+    write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
 
 def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> dict[str, object]:
@@ -197,14 +119,14 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "processed": frames,
         "skipped": len(run.broken),
         **counts,
-        "status": [status.value for status in statuses],
+        "status": statuses,
         "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
         "known_keyframes": sum(keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
         "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,
         "readout": slam.map.readout.seconds,
         "readout_sigma": slam.map.readout.sigma,
-        "warnings": run.warnings,
+        "warnings": list(run.warnings),
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "T_lw": None if (T_lw := slam.T_lw) is None else T_lw.tolist(),
         "failure": failure,
@@ -259,8 +181,8 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     known = torch.tensor([keyframe.is_from_earlier_run for keyframe in keyframes], dtype=torch.bool)
     positions = torch.searchsorted(trajectory.stamps, stamps).masked_fill(known, -1)
-    statuses = [status.value for status in slam.poses.statuses]
-    path = make_camera_path(trajectory, statuses, invert(stack_poses(keyframes)), positions, pipeline.sequence.camera)
+    T_wk, camera = invert(stack_poses(keyframes)), pipeline.sequence.camera
+    path = make_camera_path(trajectory, slam.poses.statuses, T_wk, positions, camera)
     write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import matplotlib as mpl
@@ -42,7 +43,7 @@ class CameraPath:
 
 
 def make_camera_path(
-    trajectory: Trajectory, statuses: list[str], T_wk: Tensor, positions: Tensor, camera: PinholeCamera
+    trajectory: Trajectory, statuses: Sequence[str], T_wk: Tensor, positions: Tensor, camera: PinholeCamera
 ) -> CameraPath:
     """Create the mesh of a camera path.
 
@@ -69,7 +70,7 @@ def make_camera_path(
     )
 
 
-def _colours(stamps: Tensor, statuses: list[str]) -> Tensor:
+def _colours(stamps: Tensor, statuses: Sequence[str]) -> Tensor:
     """Return the RGB of each frame and, in the last row, of an earlier run, uint8, shape (N + 1, 3)."""
     progress = (stamps - stamps[:1]) / (stamps[-1:] - stamps[:1]).clamp(min=1e-9)
     by_time = [*(mpl.colormaps["viridis"](fraction)[:3] for fraction in progress.tolist()), (0, 0, 0)]

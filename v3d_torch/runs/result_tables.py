@@ -1,0 +1,159 @@
+"""Poses and tables of a run; docs/results.md documents every file and column."""
+
+from __future__ import annotations
+
+import io
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import torch
+
+from v3d_torch.config.loading import dump_config
+from v3d_torch.datasets.tum_trajectory import write_trajectory
+from v3d_torch.errors import InputError
+from v3d_torch.evaluation import Evaluation, evaluate
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.mapping.keyframe import stack_poses
+from v3d_torch.objects.frame_objects import MotionState
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline.run_record import ObjectTable
+from v3d_torch.runs.state_table import make_state_table
+from v3d_torch.segmentation.coco import class_name
+from v3d_torch.types import Trajectory
+
+_STATE_COLUMNS = (
+    *("vx", "vy", "vz", "position_sigma", "velocity_sigma"),
+    *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
+)
+"""Columns of velocity, uncertainty and box of an object."""
+
+_DYNAMICS = pa.schema(
+    [
+        ("frame", pa.int64()),
+        ("stamp", pa.float64()),
+        ("id", pa.int64()),
+        ("class", pa.string()),
+        ("x", pa.float64()),
+        ("y", pa.float64()),
+        ("z", pa.float64()),
+        *((name, pa.float64()) for name in _STATE_COLUMNS),
+        ("votes", pa.int64()),
+        ("chamfer", pa.float64()),
+        ("motion_state", pa.string()),
+        ("missed", pa.bool_()),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class ResultTables:
+    """Poses and tables of all frames so far. They stay as they are while the run continues.
+
+    Attributes:
+        trajectory: Poses of all frames.
+        keyframes: Poses of the keyframes of the run.
+        groundtruth: True poses, if there are any.
+        evaluation: Scores, if there is ground truth and there are enough poses.
+        config: Configuration, YAML.
+        frames: Table of frames.
+        states: Table of the states of the camera.
+        dynamics: Table of objects.
+    """
+
+    trajectory: Trajectory
+    keyframes: Trajectory
+    groundtruth: Trajectory | None
+    evaluation: Evaluation | None
+    config: str
+    frames: pa.Table
+    states: pa.Table
+    dynamics: pa.Table
+
+    def write(self, folder: Path) -> None:
+        """Write all files to a folder, which is made if it is missing.
+
+        Raises:
+            OutputError: If the folder cannot be written or the disk is full.
+        """
+        write_trajectory(folder / "trajectory.txt", self.trajectory)  # first, in case the disk gets full
+        write_text(folder / "config.yaml", self.config)
+        write_trajectory(folder / "keyframes.txt", self.keyframes)
+        if self.groundtruth is not None:
+            write_trajectory(folder / "groundtruth.txt", self.groundtruth)
+        _write_table(folder / "frames.parquet", self.frames)
+        _write_table(folder / "states.parquet", self.states)
+        _write_table(folder / "dynamics.parquet", self.dynamics)
+
+
+def collect_tables(pipeline: Pipeline) -> ResultTables:
+    """Collect poses and tables of all frames so far, between two frames."""
+    slam, groundtruth = pipeline.slam, pipeline.sequence.groundtruth
+    trajectory = slam.poses.trajectory()
+    keyframes = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
+    stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
+    evaluation = None
+    if groundtruth is not None:
+        with suppress(InputError):  # too few poses for scores
+            evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count)
+    return ResultTables(
+        trajectory=trajectory,
+        keyframes=Trajectory(stamps, invert(stack_poses(keyframes))),
+        groundtruth=groundtruth,
+        evaluation=evaluation,
+        config=dump_config(slam.config),
+        frames=_frame_table(pipeline),
+        states=make_state_table(pipeline.record),
+        dynamics=_object_table(pipeline.record.dynamics),
+    )
+
+
+def _frame_table(pipeline: Pipeline) -> pa.Table:
+    """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
+    slam, times = pipeline.slam, pipeline.record.times
+    keyframes = torch.tensor([keyframe.frame for keyframe in slam.map.active_keyframes], dtype=torch.int64)
+    statuses = slam.poses.statuses[: len(times)]  # one more if a frame was interrupted
+    wall, cpu = times.wall.T.numpy(), times.cpu.T.numpy()
+    columns = {
+        "frame": times.indices.numpy(),
+        "stamp": times.stamps.numpy(),
+        "status": pa.array(statuses, pa.string()),
+        "keyframe": torch.isin(times.indices, keyframes).numpy(),
+        **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
+        **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
+    }
+    return pa.table(columns)
+
+
+def _object_table(dynamics: ObjectTable) -> pa.Table:
+    """Return the table of objects: one row per frame and object."""
+    x, y, z = dynamics["centroid"].T
+    state = torch.cat([dynamics["velocity"], dynamics["sigmas"], dynamics["box"]], dim=1)
+    motion_states, labels = [state.value for state in MotionState], dynamics["label"]
+    classes = {label: class_name(label) for label in labels.unique().tolist()}
+    columns = {
+        "frame": dynamics["frame"],
+        "stamp": dynamics["stamp"],
+        "id": dynamics["id"],
+        "class": [classes[label] for label in labels.tolist()],
+        "x": x,
+        "y": y,
+        "z": z,
+        **dict(zip(_STATE_COLUMNS, state.T, strict=True)),
+        "votes": dynamics["votes"],
+        "chamfer": dynamics["chamfer"],
+        "motion_state": [motion_states[code] for code in dynamics["motion_state"].tolist()],
+        "missed": dynamics["missed"],
+    }
+    arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
+    return pa.table(arrays, schema=_DYNAMICS)
+
+
+def _write_table(path: Path, table: pa.Table) -> None:
+    content = io.BytesIO()  # so that Python, and not pyarrow, writes the file and raises the errors
+    pq.write_table(table, content)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content.getvalue())
