@@ -14,6 +14,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction import point_map as point_map_module
+from v3d_torch.reconstruction.point_blocks import PointBlocks
 from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 
 ALL = torch.ones(240, 320, dtype=torch.bool)
@@ -180,3 +181,23 @@ def test_static_room_loses_no_points() -> None:
     kept = fuse_points(views, config())
     every = fuse_points(views, load_config(overrides=["objects.free_space.min_tolerance=100"]))
     assert len(kept) > 0.999 * len(every)
+
+
+def test_map_is_the_same_if_each_view_checks_all_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the bit; a view observes a small part of the map."""
+    step = se3_exp(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    moved = torch.linalg.matrix_power(step, 3)
+    present = [(moved @ invert(T_wc), render(T_wc, CRATE)) for T_wc in looking_around(8)]
+    absent = [(moved @ invert(T_wc), render(T_wc)) for T_wc in looking_around(8, seed=1)]
+    views = views_of(*present, *absent, (EYE, square_at(1.5)), (aside(0.1), wall(2.5)), stride=2)
+    culled, checked = fuse_points(views, config()), list[int]()
+
+    def all_points(blocks: PointBlocks, *_: object) -> Tensor:
+        checked.append(len(blocks._order))
+        return torch.arange(checked[-1])
+
+    monkeypatch.setattr(PointBlocks, "observable_by", all_points)
+    whole = fuse_points(views, config())
+    assert len(checked) == len(views) and len(whole) > 1000
+    for name in ("points", "colours", "normals"):
+        assert torch.equal(getattr(culled, name), getattr(whole, name)), name

@@ -15,6 +15,7 @@ from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.geometry.voxel import Voxels, voxel_pool
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.objects.free_space_check import DepthView, is_free_space
+from v3d_torch.reconstruction.point_blocks import PointBlocks
 
 _MIN_FREE_VIEWS = 3
 """Number of newest views that observe free space from which a surface that was observed before has gone. Single views
@@ -105,7 +106,8 @@ def _pool(points: Tensor, size: float) -> Voxels:
 def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) -> Tensor:
     """Check which points are observed as free, by at least as many views as observe a surface, or by the newest ones.
 
-    Points closer together than the depth tolerance share one check, which is faster.
+    Points closer together than the depth tolerance share one check, and a view checks only the points that it can
+    observe, which is faster.
 
     Args:
         points: Positions, world frame, metres, float64, shape :math:`(P, 3)`.
@@ -118,10 +120,12 @@ def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfi
     cells = _pool(points, config.min_tolerance / 2)
     centres = cells.means[0].to(torch.float64)
     free, occupied, free_since = torch.zeros(3, len(centres), dtype=torch.int32)  # since the last observed surface
+    blocks = PointBlocks(centres)
     for view in views:
         depth_view = DepthView(view.keyframe.stamp, view.depth[None], view.T_cw)
-        state = is_free_space(centres, depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
-        free += state == 1
-        occupied += state == 0
-        free_since = (free_since + (state == 1)) * (state != 0)
+        rows = blocks.observable_by(depth_view, views.camera, config)
+        state = is_free_space(centres[rows], depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
+        free[rows] += state == 1
+        occupied[rows] += state == 0
+        free_since[rows] = (free_since[rows] + (state == 1)) * (state != 0)
     return ((free > 0) & ((free >= occupied) | (free_since >= _MIN_FREE_VIEWS)))[cells.voxel_index[0]]
