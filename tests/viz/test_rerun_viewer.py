@@ -37,6 +37,7 @@ from v3d_torch.pipeline import NULL_VIEWER, Pipeline
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
+from v3d_torch.viz.rerun import viewer as viewer_module
 from v3d_torch.viz.rerun.objects import CLASS_IDS
 from v3d_torch.viz.rerun.occupancy import log_floor
 from v3d_torch.viz.rerun.stream import open_stream
@@ -264,6 +265,35 @@ def test_map_and_poses_are_logged_again_after_each_keyframe(recorded: tuple[Reco
     assert newest[0]["strips"] == []  # a line needs two points
     np.testing.assert_allclose(newest[3]["strips"][0], log.positions[3][1:], atol=1e-6)
     np.testing.assert_allclose(newest[8]["strips"][0], log.positions[8][6:], atol=1e-6)
+
+
+def test_only_the_recent_part_is_logged_until_the_map_has_grown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer_module, "_MAP_GROWTH", 1.9)
+    sequence = Tilted()
+    slam = V3DSLAM(CAMERA, squares, load_config(overrides=[*CONFIG, "mapping.max_keyframe_interval=2"]))
+    log = RunLog(slam)
+    pipeline = Pipeline(sequence, slam, viewer=make_viewer(None, tmp_path / "run.rrd", sequence))
+    assert pipeline(log).failure is None
+    pipeline.flush()
+    recording, last = Recording(tmp_path / "run.rrd"), FRAMES - 1
+    whole, recent = recording.at("/world/map/keyframes"), recording.at("/world/map/keyframes/recent")
+    points, newer = recording.at("/world/map/landmarks"), recording.at("/world/map/landmarks/recent")
+    paths, later = recording.at("/world/trajectory"), recording.at("/world/trajectory/recent")
+    assert set(whole) == set(points) == set(paths) == set(recording.at("/world/occupancy"))
+    assert set(recent) == set(newer) == set(later) and last in whole and len(whole) <= 4 < len(recent)
+    logged = 0
+    for index in sorted(recent):  # together they are the whole map
+        logged = index if index in whole else logged
+        counts = len(whole[logged]["strips"]), len(recent[index]["strips"])
+        assert sum(counts) == len(log.keyframes[index]) and (counts[1] == 0) == (index == logged)
+        assert len(newer[index]["positions"]) < log.landmarks[index] or index != logged
+        assert len(paths[logged]["strips"][0]) == logged + 1
+        path = np.array(later[index]["strips"][0]) if index != logged else np.zeros((0, 3))
+        np.testing.assert_allclose(path, log.positions[index][logged:] if len(path) else path, atol=1e-6)
+    assert len(points[last]["positions"]) == log.landmarks[last] and newer[last]["positions"] == []
+    np.testing.assert_allclose(paths[last]["strips"][0], log.positions[last], atol=1e-6)
 
 
 def test_ground_truth_is_aligned_at_first_pose(recorded: tuple[Recording, RunLog, Pipeline]) -> None:

@@ -32,6 +32,9 @@ _LOG = logging.getLogger("v3d_torch")
 _FLUSH_TIMEOUT = 30.0
 """Longest time to send the rest of the data to the viewer after the run, seconds."""
 
+_MAP_GROWTH = 1.1
+"""Ratio of the keyframe counts at which the whole map is logged again. In total, eleven times its size is logged."""
+
 _JPEG_QUALITY = 80
 _DEPTH_UNITS_PER_METRE = 1000
 _IMAGE_PLANE_DEPTH = 0.3  # metres from the current camera to its drawn image
@@ -47,17 +50,20 @@ class RerunViewer:
     ``world/objects``, ``world/centroids``    clouds and centroids of the objects; their class is the motion state;
                                               ``boxes``; ``paths`` of the last seconds
     ``world/votes``                           lines of votes for dynamic objects; other votes: ``without_effect``
-    ``world/map``                             ``landmarks`` and ``keyframes``, logged again after each new keyframe;
-                                              ``points`` of the static scene, at the end
+    ``world/map``                             ``landmarks`` and ``keyframes``; below them ``recent``: the part since the
+                                              map was logged; ``points`` of the static scene, at the end
     ``world/occupancy``                       occupied voxels, logged with the map; ``floor``: free cells, at the end
-    ``world/trajectory``                      all poses, logged again after each new keyframe; ``newest``: poses since
+    ``world/trajectory``                      all poses, logged with the map; ``recent``: poses since then up to the
+                                              newest keyframe; ``newest``: poses since
     ``world/groundtruth``                     ground truth, aligned at the first pose that has one
     ``seconds``, ``votes``, ``chamfer``       curves, by stage and by object id
     ``frame_summary``, ``log``                status and objects of the frame, and events, as text
     ========================================  ==========================================================================
 
-    The results of local bundle adjustment and loop closing for a keyframe are applied with the frame after it. The map
-    and all poses are logged again then. The lens distortion is not shown: the image is logged as captured.
+    The results of local bundle adjustment and loop closing for a keyframe are applied with the frame after it. The
+    recent part is logged again then. The whole map and all poses are logged after a loop is closed, when the number of
+    keyframes has grown by a tenth, and at the end: the recording grows in proportion to the run. The lens distortion is
+    not shown: the image is logged as captured.
 
     Args:
         stream: Recording, from `open_stream`.
@@ -73,7 +79,8 @@ class RerunViewer:
         self._stream = stream
         self._camera = camera
         self._unaligned = groundtruth if groundtruth is not None and has_orientations(groundtruth) else None
-        self._newest: list[NDArray[np.float64]] = []  # positions since the map was logged, and the last one before
+        self._newest: list[NDArray[np.float64]] = []  # positions since the last keyframe, and the one before
+        self._logged_keyframes = self._logged_frames = 0  # of the whole map, when it was logged
         self._pending_keyframe: Keyframe | None = None  # keyframe whose back-end result is not applied yet
         self._loops = 0
         stream.set_log_time_enabled(False)
@@ -101,7 +108,10 @@ class RerunViewer:
             self._log_camera(frame, T_wc)
             log_objects(self._stream, objects, slam.up)
             if self._pending_keyframe is not None:
-                self._log_map(slam)
+                if self._is_map_due(slam):
+                    self._log_map(slam)
+                else:
+                    self._log_recent(slam)
             else:
                 self._newest.append(T_wc[:3, 3].numpy())
             self._pending_keyframe = slam.back_end.keyframe
@@ -144,18 +154,35 @@ class RerunViewer:
         image = rr.EncodedDepthImage(blob=png, media_type="image/png", meter=_DEPTH_UNITS_PER_METRE, colormap=grey)
         self._stream.log("world/camera/image/depth", image)
 
+    def _is_map_due(self, slam: V3DSLAM) -> bool:
+        """Check whether the whole map was corrected, or has grown enough since it was logged."""
+        is_corrected = slam.loop_closer.loop_count > self._loops
+        return is_corrected or len(slam.map.keyframes) > _MAP_GROWTH * self._logged_keyframes
+
     def _log_map(self, slam: V3DSLAM) -> None:
         """Log the whole map and all poses after the latest correction."""
-        landmarks = slam.map.landmarks
-        points = landmarks["point"][landmarks["active"]].numpy()
-        grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
-        self._stream.log("world/map/landmarks", grey)
-        frustums = _frustums(self._camera, invert(stack_poses(slam.map.active_keyframes)))
-        self._stream.log("world/map/keyframes", _lines(frustums, "tab:cyan", width=0.7))
+        self._log_part(slam, 0, slam.poses.trajectory().T_wc, "")
         if slam.occupancy is not None:
             log_voxels(self._stream, slam.occupancy.map)
-        positions = slam.poses.trajectory().T_wc[:, :3, 3].numpy()
-        self._stream.log("world/trajectory", _lines([positions], "tab:blue"))
+        self._logged_keyframes, self._logged_frames = len(slam.map.keyframes), len(slam.poses)
+        self._log_recent(slam)
+
+    def _log_recent(self, slam: V3DSLAM) -> None:
+        """Log the part of map and poses that is newer than the logged map."""
+        frames = range(self._logged_frames - 1, len(slam.poses))  # the line begins at the last logged pose
+        self._log_part(slam, self._logged_keyframes, invert(slam.poses.poses_of(frames)), "/recent")
+
+    def _log_part(self, slam: V3DSLAM, first: int, T_wc: Tensor, entity: str) -> None:
+        """Log the keyframes from an index on, their landmarks, and poses, shape (N, 4, 4)."""
+        landmarks = slam.map.landmarks
+        points = landmarks["point"][landmarks["active"] & (landmarks["keyframe"] >= first)].numpy()
+        grey = rr.Points3D(points, colors=[rgba("tab:gray")], radii=rr.Radius.ui_points(1.5))
+        self._stream.log(f"world/map/landmarks{entity}", grey)
+        keyframes = [keyframe for keyframe in slam.map.active_keyframes if keyframe.index >= first]
+        frustums = _frustums(self._camera, invert(stack_poses(keyframes)))
+        self._stream.log(f"world/map/keyframes{entity}", _lines(frustums, "tab:cyan", width=0.7))
+        positions = T_wc[:, :3, 3].numpy()
+        self._stream.log(f"world/trajectory{entity}", _lines([positions], "tab:blue"))
         self._newest = list(positions[-1:])
 
     def _log_groundtruth(self, stamp: float, T_ec: Tensor, status: TrackingStatus | None) -> None:
