@@ -214,8 +214,12 @@ class Pipeline:
         return record
 
     @torch.inference_mode()
-    def flush(self) -> PointMap:
+    def flush(self, before_fusion: Callable[[], None] | None = None) -> PointMap:
         """Apply the pending results of the back end, check the camera and show the final state, after the last frame.
+
+        Args:
+            before_fusion: Called when all poses are final, before the fusion of the point map, which takes long, and
+                much memory.
 
         Returns:
             Point map of the static scene, fused from all views.
@@ -226,6 +230,8 @@ class Pipeline:
         self.warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
+        if before_fusion is not None:
+            before_fusion()
         trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
         point_map = fuse_points(self.views, self.slam.config)
         try:
