@@ -211,6 +211,7 @@ def test_interrupted_run_keeps_an_earlier_map_file_until_it_is_resumed(
     done = call("--resume", out)
     assert done.exit_code == 0 and "was not overwritten" not in done.stdout, done.stderr
     assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
+    assert not beside.exists()
 
 
 def test_viewer_that_fails_after_the_last_frame_does_not_keep_the_map_from_being_saved(

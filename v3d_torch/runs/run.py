@@ -74,6 +74,7 @@ class Run:
         system = CheckedSLAM if config.check_numerics else V3DSLAM
         slam = system(sequence.camera, segment, config, None if known_map is None else known_map.map)
         self._folder = folder
+        self._is_resumed = checkpoint is not None
         self._map_file = None if request.save_map is None else Path(request.save_map)
         self.pipeline = Pipeline(
             sequence,
@@ -139,14 +140,17 @@ class Run:
     def _save_map(self, path: Path, *, is_whole: bool) -> None:
         """Write the map file; a part of a map is written beside a map file that exists, and does not replace it."""
         pipeline, target = self.pipeline, path
+        beside = path.with_name(f"{path.stem}.partial{path.suffix}")
         if path.exists() and not pipeline.slam.map.active_keyframes:
             pipeline.warn([f"{path}: was not overwritten, because the map of this run has no keyframes"])
             return
         if path.exists() and not is_whole:
-            target = path.with_name(f"{path.stem}.partial{path.suffix}")
+            target = beside
             pipeline.warn([f"{path}: was not overwritten, because the run ended early; its map is saved to {target}"])
         try:
             save_map(target, pipeline.slam.map, pipeline.views)
+            if is_whole and self._is_resumed:
+                beside.unlink(missing_ok=True)  # the map of the same run when it ended early
         except OutputError as error:  # the other results are written nevertheless
             if is_whole:
                 pipeline.record.failure = pipeline.record.failure or str(error)
