@@ -127,6 +127,24 @@ def test_points_behind_the_camera_are_outliers() -> None:
     assert se3_log(refined.T_cw @ T_wc).abs().max() < 0.005
 
 
+@pytest.mark.parametrize("with_gradient", [False, True], ids=["kernel", "torch"])
+def test_measurements_that_are_not_finite_are_outliers(with_gradient: bool) -> None:
+    T_cw, points, measured, _ = measure_landmarks(100)
+    uv, valid = measured.uv.clone(), torch.ones(100, dtype=torch.bool)
+    points[7], points[8, 2], points[9, 0], uv[10, 1] = torch.nan, torch.inf, -torch.inf, torch.nan
+    valid[7:11] = False
+    depths = measured.inverse_depth, measured.pixel_sigma, measured.inverse_depth_sigma
+    inputs = perturb(T_cw), points.requires_grad_(with_gradient), uv, CAMERA.K, *depths
+    found, expected = refine_pose(*inputs), refine_pose(*inputs, valid=valid)
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one, other)
+    assert not found.inliers[7:11].any() and found.inliers.sum() > 85 and found.chi2[7:11].isinf().all()
+    assert se3_log(found.T_cw @ invert(T_cw)).abs().max() < 0.005
+    if with_gradient:
+        found.T_cw.sum().backward()
+        assert points.grad is not None and points.grad.isfinite().all()
+
+
 def test_refinement_is_deterministic() -> None:
     T_cw, points, measured, _ = measure_landmarks(500, 0.3)
     first, second = (refine(perturb(T_cw), points, measured) for _ in range(2))

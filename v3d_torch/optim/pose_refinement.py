@@ -171,7 +171,8 @@ def refine_pose(
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, N)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, N)`.
         weights: Weight of each measurement, not negative, shape :math:`(*, N)`; None for 1.
-        valid: Mask of the measurements that are not padding, bool, shape :math:`(*, N)`; None for all.
+        valid: Mask of the measurements that are not padding, bool, shape :math:`(*, N)`; None for all. A measurement
+            whose landmark or pixel is not finite counts as padding.
         rounds: Maximum number of rounds, at least 1.
         iterations: Maximum number of Levenberg-Marquardt steps in a round.
         tolerance: Relative change of the cost that ends a round.
@@ -205,16 +206,18 @@ def refine_pose(
     for each in (inverse_depth, weights, valid):
         if each is not None:
             KORNIA_CHECK_SHAPE(each, ["*", str(points.shape[-2])])
+    finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
+    valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     scale, offset = whiten(measured, K.to(torch.float64))
     thresholds = measured.chi2_threshold
     problem = _Problem(
-        points=fill_padding(points, None if valid is None else valid[..., None], 0.0),
+        points=fill_padding(points, valid[..., None], 0.0),
         scale=scale,
         offset=offset,
         thresholds=thresholds,
         weights=fill_padding(torch.ones_like(thresholds) if weights is None else weights, valid, 0.0),
-        valid=torch.ones_like(thresholds, dtype=torch.bool) if valid is None else valid,
+        valid=valid,
     )
     initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)
     batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2], problem.weights.shape[:-1])
