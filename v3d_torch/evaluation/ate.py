@@ -13,7 +13,7 @@ from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mea
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
-from v3d_torch.runtime.batches import fill_padding
+from v3d_torch.runtime.batches import fill_padding, mask_or_all
 
 _MIN_PLANE_SPREAD = 1e-3
 """Minimum standard deviation of the positions along their second principal axis, metres. Positions with less spread do
@@ -84,10 +84,9 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
 
 def root_mean_square(errors: Tensor, valid: Tensor | None) -> Tensor:
     """Root mean square of the errors that are valid, shape (..., N) to (...); its gradient at 0 is 0."""
-    if valid is None:
-        valid = torch.ones_like(errors, dtype=torch.bool)
-    norm = torch.linalg.vector_norm(torch.where(valid, errors, 0.0), dim=-1)
-    return norm / valid.sum(dim=-1).to(errors.dtype).sqrt()
+    present = mask_or_all(valid, errors)
+    norm = torch.linalg.vector_norm(torch.where(present, errors, 0.0), dim=-1)
+    return norm / present.sum(dim=-1).to(errors.dtype).sqrt()
 
 
 def spans_plane(positions: Tensor, valid: Tensor | None = None) -> Tensor:

@@ -13,7 +13,7 @@ from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
-from v3d_torch.runtime.batches import common_batch
+from v3d_torch.runtime.batches import common_batch, mask_or_all
 from v3d_torch.types import Trajectory
 
 
@@ -77,7 +77,7 @@ def rpe(
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
-    exists = torch.ones_like(stamps, dtype=torch.bool) if valid is None else valid
+    exists = mask_or_all(valid, stamps)
     batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1], exists.shape[:-1])
     exists = exists.expand(*batch, -1)
     order = torch.argsort(~exists, dim=-1, stable=True)  # padding last

@@ -20,7 +20,7 @@ from v3d_torch.features.usac import usac_options
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
 from v3d_torch.optim.implicit import needs_gradient
-from v3d_torch.runtime.batches import common_batch, fill_padding
+from v3d_torch.runtime.batches import common_batch, fill_padding, mask_or_all
 
 _MIN_PAIRS = 6
 """Minimum number of pairs: a sample of 5, and one more pair that can confirm its matrix."""
@@ -81,7 +81,7 @@ def essential_ransac(
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     weights = torch.ones_like(uv_a[..., 0]) if weights is None else weights
-    present = torch.ones_like(uv_a[..., 0], dtype=torch.bool) if valid is None else valid
+    present = mask_or_all(valid, uv_a[..., 0])
     pairs = weights.shape[:-1], present.shape[:-1]
     batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], *pairs)
     mask = present.expand(*batch, -1)

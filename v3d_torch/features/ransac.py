@@ -21,7 +21,7 @@ from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
 from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
 from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
-from v3d_torch.runtime.batches import common_batch
+from v3d_torch.runtime.batches import common_batch, mask_or_all
 
 _MIN_EPIPOLAR_PAIRS = 8
 """Minimum number of pairs for a fundamental matrix (eight-point algorithm)."""
@@ -106,7 +106,7 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    present = torch.ones_like(uv[..., 0], dtype=torch.bool) if valid is None else valid
+    present = mask_or_all(valid, uv[..., 0])
     guess = torch.Size() if initial_guess is None else initial_guess.shape[:-2]
     batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2], present.shape[:-1], guess)
     mask = present.expand(*batch, -1)

@@ -27,6 +27,11 @@ def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
     return values if valid is None else torch.where(valid, values, filler)
 
 
+def mask_or_all(valid: Tensor | None, values: Tensor) -> Tensor:
+    """Return a mask, or a mask of all values if it is None."""
+    return torch.ones_like(values, dtype=torch.bool) if valid is None else valid
+
+
 def fill_indices(name: str, indices: Tensor, count: int, valid: Tensor | None) -> Tensor:
     """Replace the padding of indices by 0, after a check of the others: kernels do not check what they read.
 
