@@ -170,7 +170,7 @@ def notes(outcomes: Sequence[Outcome], known: Mapping[str, Any]) -> Iterator[str
             notes_of.setdefault(note, []).append(outcome.sequence)
     yield from (f"- {', '.join(unique(sequences))}: {note}" for note, sequences in notes_of.items())
     if any(Path(outcome.sequence).name in known["sequences"] for outcome in outcomes):
-        yield f"- {known['about']}"
+        yield f"- {descriptions.about_peers()}"
 
 
 def known_scores(sequence: str, known: Mapping[str, Any]) -> dict[str, str]:

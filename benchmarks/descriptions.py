@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,26 @@ import yaml
 from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
 
 PEERS: Mapping[str, Any] = yaml.safe_load(Path(__file__).with_name("peers.yaml").read_text(encoding="utf-8"))
+
+
+def about_peers() -> str:
+    """Return how the systems that are not run were measured, and their speed."""
+    return str(PEERS["about"]).format(fps=peer_speeds("fps"), cpu_ms=peer_speeds("cpu_ms"))
+
+
+def peer_speeds(quantity: str) -> str:
+    """Return a speed of each system that is not run, in the order of `peer_names`; ``fps`` or ``cpu_ms``."""
+    return _enumerate(str(speeds[quantity]) for speeds in PEERS["speed"].values())
+
+
+def peer_names() -> str:
+    """Return the names of the systems that are not run."""
+    return _enumerate(PEERS["speed"])
+
+
+def _enumerate(texts: Iterable[str]) -> str:
+    *first, last = texts
+    return f"{', '.join(first)} and {last}"
 
 
 def kind(sequence: str) -> str:

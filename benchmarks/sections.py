@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import columns
-from descriptions import PEERS, sequence_notes
+from descriptions import about_peers, sequence_notes
 from storage import Measurement
 from tables import (
     VARIANTS,
@@ -40,7 +40,7 @@ def pivot_table(index: str, value: str, names: Mapping[str, str] | None = None) 
 
 def accuracy_remarks(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield the source of published values, and notes on measurements and sequences."""
-    yield f"ORB-SLAM2, ORB-SLAM3, NGD-SLAM: {PEERS['about']}"
+    yield f"ORB-SLAM2, ORB-SLAM3, NGD-SLAM: {about_peers()}"
     yield from notes(measurements)
     yield from (f"{name}: {note}" for note, name in sequence_notes())
 

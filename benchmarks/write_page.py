@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from descriptions import sequence_list
+from descriptions import peer_names, peer_speeds, sequence_list
 from sections import SECTIONS, section_lines
 from storage import RESULTS, load
 from tables import accuracy_table, commits, speed_table
@@ -54,8 +54,8 @@ def main_tables(folder: Path = RESULTS) -> str:
         *accuracy_table(accuracy),
         "",
         "**Speed** on whole sequences at 640x480 on two cores, including reading of the images. ORB-SLAM3 is"
-        " pyorbslam3. Built from source, on another idle machine with two cores, ORB-SLAM2, ORB-SLAM3 and NGD-SLAM"
-        " process 39, 50 and 57 frames per second.",
+        f" pyorbslam3. Built from source, on another idle machine with two cores, {peer_names()}"
+        f" process {peer_speeds('fps')} frames per second.",
         "",
         *speed_table(speed),
         "",

@@ -21,6 +21,7 @@ from v3d_torch.types import Instances, RGBDFrame
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import accuracy
+import descriptions
 import growth
 import segmentation
 import speed
@@ -207,7 +208,7 @@ class TestTables:
         assert "- turn 2, open3d: broke" in list(speed.failures(turns))
 
     def test_accuracy_table_has_ours_then_peers_then_published(self, tmp_path: Path) -> None:
-        known = {"sequences": {"a": {"what": "a room", "ate": {"ORB-SLAM3": "0.5"}}}, "about": "elsewhere"}
+        known = {"sequences": {"a": {"what": "a room", "ate": {"ORB-SLAM3": "0.5"}}}}
         figures = {"frames": 9, "ate": {"rmse": 0.25}, "fps": 3.0, "coverage": 0.5}
         outcomes = [accuracy.Outcome("a", name, 0, figures) for name in ("full", "pyorbslam3")]
         head, _, line = accuracy.accuracy_table(outcomes, known, tmp_path)
@@ -239,6 +240,12 @@ class TestPage:
     def test_readme_tables_are_made_of_stored_measurements(self) -> None:
         readme = write_page.README.read_text(encoding="utf-8")
         assert readme == write_page.insert_tables(readme, write_page.main_tables())
+
+    def test_speeds_of_systems_that_are_not_run_are_those_of_their_file(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        speed = {name: {"fps": fps, "cpu_ms": 2 * fps} for name, fps in (("A", 11), ("B", 12), ("C", 13))}
+        monkeypatch.setitem(descriptions.PEERS, "speed", speed)
+        assert "A, B and C process 11, 12 and 13 frames per second." in write_page.main_tables()
+        assert "process 11, 12 and 13 frames per second with 22, 24 and 26 CPU ms per frame" in write_page.page()
 
     def test_missing_marks_are_an_error(self) -> None:
         with pytest.raises(ValueError, match=r"benchmarks:main"):
