@@ -28,6 +28,22 @@ def test_normals_equal_those_of_the_twin(height: int, width: int, radius: int) -
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("coordinates", [slice(0, 1), slice(1, 2), slice(2, 3), slice(0, 3)])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_points_that_are_not_finite_count_as_not_measured(value: float, coordinates: slice) -> None:
+    generator = torch.Generator().manual_seed(1)
+    points = torch.rand(1, 40, 50, 3, generator=generator)
+    points[..., 2] = 2 + 0.01 * points[..., 2]
+    invalid = torch.rand(1, 40, 50, generator=generator) < 0.05
+    invalid[0, 10, 10] = True
+    points[..., coordinates][invalid] = value
+    found, expected = TWIN.compiled(points, 2), TWIN.torch(points, 2)
+    assert torch.equal(found != 0, expected != 0) and found.isfinite().all()
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5)
+    assert (found[0, 10, [9, 11]] == 0).all() and (found[0, [9, 11], 10] == 0).all()
+    assert coordinates.stop < 3 or (found[0, 10, 10] == 0).all()
+
+
 def test_layout_of_the_points_does_not_matter() -> None:
     """A view of channels-first points is not contiguous."""
     points = 1 + 0.01 * torch.rand(1, 3, 20, 30, generator=torch.Generator().manual_seed(0))

@@ -36,8 +36,8 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     averaged depths would bend the plane.
 
     Args:
-        points: Points in the camera frame, metres, one per pixel, floating point, shape :math:`(B, H, W, 3)`; z = 0
-            for pixels without measurement.
+        points: Points in the camera frame, metres, one per pixel, floating point, shape :math:`(B, H, W, 3)`; z = 0,
+            NaN or infinite for pixels without measurement.
         radius: Half the side of the window, pixels; every other row and column of the window is used.
         edge_ratio: Pixels whose depths differ by more than this fraction lie on different surfaces.
 
@@ -51,9 +51,10 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     z = points[..., 2]
     right, left, below, above = (_shift(points, *offset) for offset in ((0, 1), (0, -1), (1, 0), (-1, 0)))
     near = [(side[..., 2] > 0) & ((side[..., 2] - z).abs() <= edge_ratio * z) for side in (right, left, below, above)]
-    valid = torch.stack([z > 0, *near]).all(dim=0)[..., None]
     # With x right and y down, this order makes the normals point towards the camera (-z).
-    products = torch.where(valid, torch.linalg.cross(below - above, right - left), 0.0)
+    products = torch.linalg.cross(below - above, right - left)
+    valid = torch.stack([z > 0, z < torch.inf, *near, products.isfinite().all(dim=-1)]).all(dim=0)[..., None]
+    products = torch.where(valid, products, 0.0)
     steps = range(-radius, radius + 1, 2) if radius else (0,)
     total = torch.zeros_like(products)
     for offset in product(steps, steps):

@@ -15,9 +15,9 @@ def _multiply_differences(points: Array, edge_ratio: np.float32, products: Array
     """Write the cross product of the differences of each pixel's neighbours, if all lie on one surface.
 
     Args:
-        points: Points, camera frame, (H, W, 3); z = 0 without measurement.
+        points: Points, camera frame, (H, W, 3); z = 0 or not finite without measurement.
         edge_ratio: Largest difference between depths on one surface, as a fraction of the depth.
-        products: Cross products, zeros, (3, H, W); written.
+        products: Cross products, zeros, (3, H, W); written if they are finite.
         valid: True where a product is written, zeros, (H, W).
     """
     height, width, _ = points.shape
@@ -28,14 +28,13 @@ def _multiply_differences(points: Array, edge_ratio: np.float32, products: Array
             right, left, below, above = points[v, u + 1], points[v, u - 1], points[v + 1, u], points[v - 1, u]
             nearest = min(min(right[2], left[2]), min(below[2], above[2]))
             farthest = max(max(right[2], left[2]), max(below[2], above[2]))
-            if not (z > 0 and nearest > 0 and z - nearest <= limit and farthest - z <= limit):
+            if not (0 < z < np.inf and nearest > 0 and z - nearest <= limit and farthest - z <= limit):
                 continue
             x0, y0, z0 = below[0] - above[0], below[1] - above[1], below[2] - above[2]
             x1, y1, z1 = right[0] - left[0], right[1] - left[1], right[2] - left[2]
-            products[0, v, u] = y0 * z1 - z0 * y1
-            products[1, v, u] = z0 * x1 - x0 * z1
-            products[2, v, u] = x0 * y1 - y0 * x1
-            valid[v, u] = True
+            x, y, w = y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1
+            if np.isfinite(x) and np.isfinite(y) and np.isfinite(w):  # minimum and maximum can ignore NaN
+                products[0, v, u], products[1, v, u], products[2, v, u], valid[v, u] = x, y, w, True
 
 
 @device

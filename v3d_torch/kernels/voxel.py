@@ -25,16 +25,15 @@ def pool_voxels(points: Points, size: np.float32, max_voxels: float) -> tuple[Po
         box is too large or a point is not finite.
     """
     count = len(points)
-    cells = np.empty((count, 3), np.float32)
-    low, high = np.full(3, np.inf, np.float32), np.full(3, -np.inf, np.float32)
+    cells, low, high = np.empty((count, 3)), np.full(3, np.inf), np.full(3, -np.inf)  # double, to be subtracted
     finite = True
     for i in range(count):
         for axis in range(3):
-            cell = np.floor(points[i, axis] / size)
+            cell = np.float64(np.floor(points[i, axis] / size))
             finite &= np.isfinite(cell)
             cells[i, axis], low[axis], high[axis] = cell, min(low[axis], cell), max(high[axis], cell)
     means, sizes, voxels = np.zeros((count, 3), np.float32), np.zeros(count, np.int64), np.empty(count, np.int64)
-    sides = high.astype(np.float64) - low + 1
+    sides = high - low + 1
     if count == 0 or not finite or not sides[0] * sides[1] * sides[2] < max_voxels:
         return means[:0], sizes[:0], voxels
     keys, (side_y, side_z) = np.empty(count, np.int64), (np.int64(sides[1]), np.int64(sides[2]))
