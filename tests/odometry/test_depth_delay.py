@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -55,6 +56,20 @@ def test_uncompensated_depth_is_wrong_by_more() -> None:
     expected = features_in(wall_depth(torch.eye(4, dtype=torch.float64))).depth
     uncompensated = features_in(wall_depth(se3_exp(0.02 * VELOCITY))).depth
     assert float((uncompensated - expected).abs().max()) > 0.03
+
+
+@pytest.mark.parametrize("forward", [1.0, -1.0])
+@pytest.mark.parametrize("near", [1.0, 5.0])
+def test_depth_beside_an_edge_moves_with_its_own_surface(near: float, forward: float) -> None:
+    """The camera turns by ten pixels between the images; the left half of the scene has another depth."""
+    velocity = torch.tensor([0.0, 0.0, -forward, 0.0, 1.0, 0.0], dtype=torch.float64)
+    seen, delay = torch.full((1, CAMERA.height, CAMERA.width), near - forward * 0.02), 0.02
+    seen[:, :, 331:] = 3.0 - forward * 0.02  # the edge at the time of the depth image
+    pixel = torch.tensor([[column, 240] for column in range(322, 330)])
+    none = torch.zeros(len(pixel), 32, dtype=torch.uint8)
+    features = Features(pixel.double(), pixel, sample_depth(pixel, seen, 8.0), torch.zeros(len(pixel)).long(), none)
+    found = DepthDelayCompensation(Config(), CAMERA)(features, seen, velocity, delay)
+    assert float((found.depth - 3.0).abs().max()) < 0.003
 
 
 def test_features_are_unchanged_without_delay_or_if_disabled() -> None:

@@ -43,11 +43,12 @@ def compensate_depth_delay(
     height, width = depth_image.shape
     depth = np.zeros(len(uv))
     for i in range(len(uv)):
-        du, dv, rate = _motion_field(uv[i, 0], uv[i, 1], inverse_depth[i], velocity, intrinsics)
+        du, dv, _ = _motion_field(uv[i, 0], uv[i, 1], inverse_depth[i], velocity, intrinsics)
         column, row = np.rint(pixel[i, 0] + delay * du), np.rint(pixel[i, 1] + delay * dv)
         if 0 <= column < width and 0 <= row < height:
             z = np.float64(depth_image[int(row), int(column)])
             if 0 < z <= max_depth:
+                _, _, rate = _motion_field(uv[i, 0], uv[i, 1], 1 / z, velocity, intrinsics)
                 depth[i] = z / (1 - delay * rate * z)
     return depth
 

@@ -59,8 +59,9 @@ class DepthDelayCompensation:
     def __call__(self, features: Features, depth: Tensor, velocity: Tensor, delay: float) -> Features:
         r"""Sample the depth of features at the time of the depth image, and convert it to the time of the colour image.
 
-        With the inverse depth's rate :math:`\dot w` of the motion field, the delay :math:`\tau` and the sampled depth
-        :math:`z`, the depth at the time of the colour image is :math:`z / (1 - \tau \dot w z)`.
+        With delay :math:`\tau`, sampled depth :math:`z` and rate :math:`\dot w` of its inverse by the motion
+        field, the depth at the time of the colour image is :math:`z / (1 - \tau \dot w z)`. The given depth of a
+        feature beside a depth edge can be that of another surface, with another rate.
 
         Args:
             features: Features of the colour image.
@@ -74,7 +75,8 @@ class DepthDelayCompensation:
         """
         if not delay or not self._enabled:
             return features
-        pixel_velocity, rate = motion_field(features.uv, features.inverse_depth, velocity, self._camera.K)
+        pixel_velocity, _ = motion_field(features.uv, features.inverse_depth, velocity, self._camera.K)
         shifted = (features.pixel + delay * pixel_velocity).round().to(torch.int64)
         z = sample_depth(shifted, depth, self._max_depth)
+        _, rate = motion_field(features.uv, torch.where(z > 0, 1 / z, 0.0), velocity, self._camera.K)
         return replace(features, depth=torch.where(z > 0, z / (1 - delay * rate * z), 0.0))
