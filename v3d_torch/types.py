@@ -216,12 +216,15 @@ class FramePose:
         landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
         information: Information matrix of the left perturbation of ``T_cw``, under the assumption that the errors of
             the features are independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
+        is_relocalised: True if the camera was found again in the map. The change of the pose since the previous frame
+            then contains the error of the previous pose, and is no velocity.
     """
 
     status: TrackingStatus
     T_cw: Tensor
     landmarks: Tensor
     information: Tensor | None = None
+    is_relocalised: bool = False
 
     @property
     def observed_landmarks(self) -> Tensor:

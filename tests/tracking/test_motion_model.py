@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from helpers.moving_camera import EYE, TWIST, Camera, frame_pose, twists, walk
 from hypothesis import given, settings
@@ -75,3 +77,13 @@ def test_jump_of_a_relocalised_camera_is_not_a_velocity() -> None:
     away = se3_exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64))
     camera.append(20 / 30, frame_pose(away), None)
     torch.testing.assert_close(camera.predict(21 / 30), away, rtol=0, atol=1e-12)
+
+
+def test_jump_of_a_camera_relocalised_after_odometry_is_not_a_velocity() -> None:
+    step, away = se3_exp(TWIST / 30), se3_exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64))
+    for T_cp in (None, step):
+        camera = walk([0.0, 1 / 30])
+        for k in range(2, 20):
+            camera.append(k / 30, frame_pose(step @ camera.poses.T_cw, TrackingStatus.ODOMETRY), None, step)
+        camera.append(20 / 30, replace(frame_pose(away), is_relocalised=True), None, T_cp)
+        torch.testing.assert_close(camera.predict(21 / 30), step @ away, rtol=0, atol=1e-9)

@@ -63,7 +63,12 @@ _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
         **dict.fromkeys(("covariance", "twist_covariance", "cross_covariance"), (torch.float64, (6, 6))),
         "twist": (torch.float64, (6,)),
     },
-    FramePose: {"status": TrackingStatus, "T_cw": (torch.float64, (4, 4)), "landmarks": (torch.int64, ("N",))},
+    FramePose: {
+        "status": TrackingStatus,
+        "T_cw": (torch.float64, (4, 4)),
+        "landmarks": (torch.int64, ("N",)),
+        "is_relocalised": bool,
+    },
 }
 """Fields of each class that a stage returns: dtype and shape of tensors, else the type."""
 

@@ -69,12 +69,16 @@ class CameraTracker:
         if self._map.keyframes:
             local_map = self._map.local_map(poses.observed_landmarks, self._local_keyframes)
             tracking = self._track_map(features, T_cw, local_map, landmarks, depth)
+            was_in_map = poses.status in (TrackingStatus.TRACKED, TrackingStatus.DISCONNECTED)
+            is_relocalised = tracking is None or not was_in_map
             if tracking is None:
                 match = self._relocaliser.relocalise(features, self._map)
                 tracking = None if match is None else match.tracking
             if tracking is not None:
                 self._map.count_matches(tracking.found, tracking.visible)
-                return FramePose(TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks, tracking.information)
+                return FramePose(
+                    TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks, tracking.information, is_relocalised
+                )
         known = motion.is_measured and poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
         status = TrackingStatus.ODOMETRY if known else TrackingStatus.LOST
         return FramePose(status, T_cw, torch.full((len(features),), -1, dtype=torch.int64))

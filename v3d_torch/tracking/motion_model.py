@@ -84,11 +84,11 @@ class MotionModel:
         if not len(poses):
             return
         elapsed = stamp - poses.stamp
-        if pose.status is TrackingStatus.LOST and motion.is_measured:
+        if motion.is_measured and (pose.status is TrackingStatus.LOST or pose.is_relocalised):
             self.velocity = motion.velocity
         elif pose.status is TrackingStatus.LOST:
             self.velocity = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
-        elif poses.status is not TrackingStatus.LOST and elapsed > 0:
+        elif poses.status is not TrackingStatus.LOST and not pose.is_relocalised and elapsed > 0:
             self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / max(elapsed, MIN_INTERVAL)
 
     def state_dict(self) -> dict[str, Any]:

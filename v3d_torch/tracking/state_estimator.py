@@ -80,7 +80,7 @@ class StateEstimator:
             self._pose_noise.interrupt()
             self._covariance = _transform(self._covariance, motion.T_cp) + self._frame_noise
         if pose.information is not None or defines_world or motion.is_measured:
-            self._filter_measured(stamp, T_wc, motion)
+            self._filter_measured(stamp, T_wc, motion, is_continuous=not pose.is_relocalised)
             self._known_covariance, self._last_measured = self._covariance, stamp
         else:
             self._filter_predicted(stamp, T_wc)
@@ -138,9 +138,9 @@ class StateEstimator:
         self._frame_noise, self._owners = self._pose_noise.scale(nominal), owners
         return self._pose_noise.scale(nominal, 1 + self._map_noise(owners))
 
-    def _filter_measured(self, stamp: float, T_wc: Tensor, motion: CameraMotion) -> None:
-        """Update the filter with a pose; restart it if the previous motion was not measured."""
-        if self._last_measured == self._filter.stamp:
+    def _filter_measured(self, stamp: float, T_wc: Tensor, motion: CameraMotion, *, is_continuous: bool) -> None:
+        """Update the filter with a pose; restart it if the pose does not continue a measured one."""
+        if is_continuous and self._last_measured == self._filter.stamp:
             self._filter.predict(stamp)
             self._filter.update(T_wc, self._frame_noise)
         else:
