@@ -46,3 +46,14 @@ def test_jump_of_a_camera_that_is_found_again_is_not_a_twist() -> None:
             camera(frame_pose(EYE, status))
         for state in (camera(replace(tracked(away), is_relocalised=True)), camera(tracked(away))):
             assert state.twist.norm() < 0.01
+
+
+def test_covariance_of_a_camera_not_yet_found_is_that_of_an_unknown_pose_at_any_time() -> None:
+    camera, start = RestingCamera(), 1.3e9
+    state = camera(frame_pose(EYE, TrackingStatus.LOST), is_measured=False, start=start)
+    expected = torch.tensor([100.0] * 3 + [torch.pi] * 3, dtype=torch.float64)
+    torch.testing.assert_close(state.covariance, expected.square().diag())
+    assert torch.equal(state.twist_covariance.diagonal().sqrt(), torch.tensor([1.0] * 3 + [2.0] * 3).double())
+    for is_measured in (True, False):
+        state = camera(frame_pose(EYE, TrackingStatus.LOST), is_measured=is_measured, start=start)
+        torch.testing.assert_close(state.covariance.diagonal().sqrt(), expected, rtol=0.01, atol=0)

@@ -6,6 +6,7 @@ theory for state estimation in robotics, 2018, Sec. V).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -25,7 +26,7 @@ class PoseKalmanFilter:
     """Kalman filter of pose and twist of the camera. Call `start` before any other method.
 
     Attributes:
-        stamp: Time of the state, seconds.
+        stamp: Time of the state, seconds; NaN before the first `start`.
         T_wc: Filtered camera-to-world pose, float64, shape :math:`(4, 4)`.
         twist: Filtered twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
         covariance: Covariance of the errors of pose and twist, float64, shape :math:`(12, 12)`.
@@ -34,7 +35,12 @@ class PoseKalmanFilter:
     """
 
     def __init__(self) -> None:
-        self.start(0.0, torch.eye(4, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64))
+        self.start(math.nan, torch.eye(4, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64))
+
+    @property
+    def is_started(self) -> bool:
+        """True once `start` was called."""
+        return not math.isnan(self.stamp)
 
     def start(self, stamp: float, T_wc: Tensor, covariance: Tensor, twist: Tensor | None = None) -> None:
         """Reset the state to a measured pose.

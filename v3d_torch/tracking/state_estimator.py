@@ -149,6 +149,8 @@ class StateEstimator:
 
     def _filter_predicted(self, stamp: float, T_wc: Tensor) -> None:
         """Set the filter to a predicted pose; the predicted camera stops after some time."""
+        if not self._filter.is_started:
+            self._filter.start(stamp, T_wc, torch.zeros(6, 6, dtype=torch.float64))
         self._filter.predict(stamp)
         self._filter.T_wc = T_wc
         if stamp - self._last_measured >= MAX_EXTRAPOLATION:
