@@ -176,6 +176,22 @@ def test_lost_frames_found_in_a_disconnected_part_are_disconnected() -> None:
     assert camera.poses.statuses == 4 * [TrackingStatus.DISCONNECTED]
 
 
+@pytest.mark.parametrize(("part", "status"), [(0, ODOMETRY), (1, TrackingStatus.DISCONNECTED)])
+def test_lost_frames_before_a_keyframe_of_a_lost_camera_belong_to_its_part(part: int, status: TrackingStatus) -> None:
+    """The keyframe starts the map or another part; only the frames that measured motions link to it belong to it."""
+    camera = begin_lost(4, unknown=(2,))
+    before = invert(camera.trajectory().T_wc)
+    own = keyframe(STEP @ before[3], part=part)
+    reference = keyframe() if part else None
+    assert camera.append(0.4, frame_pose(own.T_cw, LOST), reference, STEP, own) is None
+    found = TRACKED if part == 0 else status
+    assert camera.poses.statuses == [LOST, LOST, status, status, found]
+    own.T_cw = own.T_cw @ invert(HIDDEN)  # a loop moves the part
+    expected = torch.cat([before[2:] @ invert(HIDDEN), own.T_cw[None]])
+    torch.testing.assert_close(camera.poses.poses_of([2, 3, 4]), expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(camera.poses.poses_of([0, 1]), before[:2], rtol=0, atol=1e-9)
+
+
 # --- corrections of keyframes
 
 

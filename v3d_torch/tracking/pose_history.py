@@ -87,8 +87,9 @@ class PoseHistory:
     ) -> Tensor | None:
         """Append the pose of a frame.
 
-        When the camera is found again, the lost frames before it get poses from the measured motions. When it is found
-        for the first time, all earlier frames are moved, because their world frame was a guess.
+        When the camera is found again, or starts a part of the map, the lost frames before it get poses from the
+        measured motions. When it is found for the first time, all earlier frames are moved, because their world frame
+        was a guess.
 
         Args:
             stamp: Timestamp, seconds.
@@ -101,30 +102,27 @@ class PoseHistory:
             If the camera was found for the first time, the transform ``T_new_old`` from the guessed world frame to that
             of the map, float64, shape :math:`(4, 4)`; else None.
         """
-        status = pose.status
-        if status is TrackingStatus.TRACKED and reference is not None and reference.disconnected:
-            status = TrackingStatus.DISCONNECTED
+        keyframe = reference if new is None else new
+        status, is_found = _status(pose, keyframe, is_new=new is not None), pose.status is not TrackingStatus.LOST
         T_new_old = None
         if self.status is TrackingStatus.LOST and status is not TrackingStatus.LOST:
-            correction = orthonormalise(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
-            first = not self.is_localised
-            self._correct_lost(correction, reference, motion.is_measured, move_all=first)
+            correction = torch.eye(4, dtype=torch.float64)  # a lost camera starts a part of the map where it is
+            if is_found:
+                correction = orthonormalise(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
+            first = is_found and not self.is_localised
+            self._correct_lost(correction, keyframe, motion.is_measured, move_all=first)
             T_new_old = correction if first else None
         if new is None:
             T_ck = _relative(pose.T_cw, reference)
             if pose.count:
                 self.observed_landmarks, self._place = pose.observed_landmarks, reference
         else:
-            if new.disconnected:
-                status = TrackingStatus.DISCONNECTED
-            elif status is TrackingStatus.LOST:
-                status = TrackingStatus.TRACKED  # the first keyframe of the map
-            reference, T_ck = new, torch.eye(4, dtype=torch.float64)
+            T_ck = torch.eye(4, dtype=torch.float64)
             self.observed_landmarks, self._place = new.observed_landmarks, new
         self._frames.append(
             stamp=torch.tensor([stamp], dtype=torch.float64),
             status=torch.tensor([_STATUSES.index(status)]),
-            keyframe=torch.tensor([self._add_keyframe(reference)]),
+            keyframe=torch.tensor([self._add_keyframe(keyframe)]),
             T_ck=T_ck[None],
             has_motion=torch.tensor([motion.is_measured]),
         )
@@ -205,6 +203,15 @@ class PoseHistory:
         T_kw = torch.eye(4, dtype=torch.float64).repeat(max(self._keyframes, default=-1) + 2, 1, 1)
         T_kw[list(self._keyframes)] = stack_poses(list(self._keyframes.values()))
         return T_kw
+
+
+def _status(pose: FramePose, keyframe: Keyframe | None, *, is_new: bool) -> TrackingStatus:
+    """Return the status of a frame, given its reference keyframe, or the new keyframe created from it."""
+    is_in_map = is_new or pose.status is TrackingStatus.TRACKED
+    if is_in_map and keyframe is not None and keyframe.disconnected:
+        return TrackingStatus.DISCONNECTED
+    starts_map = is_new and pose.status is TrackingStatus.LOST
+    return TrackingStatus.TRACKED if starts_map else pose.status
 
 
 def _pose(keyframe: Keyframe | None) -> Tensor:
