@@ -263,6 +263,18 @@ def test_frames_of_a_disconnected_keyframe_are_disconnected() -> None:
     assert camera.poses.statuses == [TrackingStatus.DISCONNECTED, TrackingStatus.DISCONNECTED, TrackingStatus.ODOMETRY]
 
 
+def test_frames_of_a_part_that_a_loop_joins_with_the_rest_are_tracked() -> None:
+    camera = begin_lost(2)
+    guess, other = keyframe(part=1), keyframe(part=2)
+    camera.append(0.2, frame_pose(EYE, LOST), keyframe(), STEP, guess)
+    camera.append(0.3, frame_pose(EYE), other, STEP)
+    camera.append(0.4, frame_pose(EYE), guess, STEP)
+    assert camera.poses.statuses == 5 * [TrackingStatus.DISCONNECTED]
+    guess.part = 0
+    assert camera.poses.statuses == [*3 * [TRACKED], TrackingStatus.DISCONNECTED, TRACKED]
+    assert camera.poses.status is TRACKED
+
+
 def test_landmark_ids_are_those_of_the_last_found_frame() -> None:
     camera = Camera()
     camera.append(0.0, frame_pose(EYE, landmarks=(5, -1, 2)), None)

@@ -28,7 +28,7 @@ class PoseHistory:
     def __init__(self) -> None:
         self._frames = TensorTable(
             stamp=((), torch.float64),
-            status=((), torch.int64),  # position in TrackingStatus
+            status=((), torch.int64),  # position in TrackingStatus, as it was known when the row was made
             keyframe=((), torch.int64),  # index of the keyframe; -1 for the world frame, before the first keyframe
             T_ck=((4, 4), torch.float64),  # motion from the keyframe to the camera
             has_motion=((), torch.bool),  # true if the motion since the previous frame was measured
@@ -44,13 +44,16 @@ class PoseHistory:
 
     @property
     def statuses(self) -> list[TrackingStatus]:
-        """Statuses of all frames."""
-        return [_STATUSES[code] for code in self._frames["status"].tolist()]
+        """Statuses of all frames as they are known now."""
+        rows = zip(self._frames["status"].tolist(), self._frames["keyframe"].tolist(), strict=True)
+        return [self._current_status(code, keyframe) for code, keyframe in rows]
 
     @property
     def status(self) -> TrackingStatus | None:
-        """Status of the last frame; None before the first."""
-        return _STATUSES[int(self._frames["status"][-1])] if len(self) else None
+        """Status of the last frame as it is known now; None before the first."""
+        if not len(self):
+            return None
+        return self._current_status(int(self._frames["status"][-1]), int(self._frames["keyframe"][-1]))
 
     @property
     def stamp(self) -> float:
@@ -193,6 +196,12 @@ class PoseHistory:
     def _keyframe_of(self, row: int) -> Keyframe | None:
         """Return the keyframe to which the pose of a frame is relative; None for the world frame."""
         return self._keyframes.get(int(self._frames["keyframe"][row]))
+
+    def _current_status(self, code: int, keyframe: int) -> TrackingStatus:
+        """Return the status of a row: a loop can have joined the part of the map of its keyframe with the rest."""
+        status, reference = _STATUSES[code], self._keyframes.get(keyframe)
+        is_joined = reference is not None and not reference.disconnected
+        return TrackingStatus.TRACKED if status is TrackingStatus.DISCONNECTED and is_joined else status
 
     def _pose_of(self, row: int) -> Tensor:
         """Return the world-to-camera pose of a frame in the current map, float64, shape (4, 4)."""
