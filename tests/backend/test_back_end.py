@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from typing import Any
 
 import pytest
 import torch
@@ -17,9 +18,11 @@ from torch import Tensor
 import v3d_torch.backend.back_end
 from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.backend.back_end import BackEnd
+from v3d_torch.backend.loop_closer import LoopCorrection
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
+from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
 from v3d_torch.pipeline import Pipeline
 
@@ -103,6 +106,25 @@ def test_error_in_the_background_is_raised_with_the_next_frame(
     slam(demo[0])
     with pytest.raises(ZeroDivisionError, match="no good"):
         slam(demo[1])
+
+
+@pytest.mark.parametrize("in_background", [True, False])
+def test_run_that_an_error_in_the_background_ended_has_a_map(
+    in_background: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pipeline = make_pipeline(prefetch=in_background)
+    detect_loop = pipeline.slam.loop_closer.detect_loop
+
+    def detect_or_fail(keyframe: Keyframe, *rest: Any) -> LoopCorrection | None:
+        if keyframe.index == 3:
+            raise MemoryError("too large")
+        return detect_loop(keyframe, *rest)
+
+    monkeypatch.setattr(pipeline.slam.loop_closer, "detect_loop", detect_or_fail)
+    failure = pipeline().failure
+    assert failure is not None and "too large" in str(failure)
+    assert len(pipeline.flush()) > 0
+    assert pipeline.slam.back_end.keyframe is None
 
 
 def test_thread_ends_when_the_system_is_deleted(demo: RGBDSequence) -> None:

@@ -72,8 +72,17 @@ class BackEnd:
         self._get_result = optimise if self._executor is None else self._executor.submit(optimise).result
 
     def result(self) -> BackEndResult | None:
-        """Wait for the pending result and return it; None if no keyframe is pending."""
-        return None if self._get_result is None else self._get_result()
+        """Wait for the pending result and return it; None if no keyframe is pending.
+
+        An error of the computation is raised once; no keyframe is pending then, so that the map can still be used.
+        """
+        if self._get_result is None:
+            return None
+        try:
+            return self._get_result()
+        except Exception:
+            self.keyframe = self._get_result = None
+            raise
 
     def apply(self, result: BackEndResult) -> Tensor | None:
         """Change the map according to a result, then cull landmarks and redundant keyframes.
