@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import walls
 from helpers.unpickled_code import CreatesFile
-from helpers.walls import CAMERA
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError, OutputError
@@ -22,9 +23,10 @@ from v3d_torch.mapping.map_columns import to_columns
 from v3d_torch.mapping.map_io import StoredMap, load_map, save_map
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
-from v3d_torch.odometry.rolling_shutter import Readout
+from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
 
 CONFIG = load_config(overrides=["segmentation.source=none"])
+CAMERA = replace(walls.CAMERA, readout=None)
 
 
 def random_map(keyframes: int = 4, seed: int = 0) -> StoredMap:
@@ -209,6 +211,30 @@ def test_invalid_readout_is_rejected(readout: object, tmp_path: Path) -> None:
     rewrite(path, about=changed_header(path, readout=readout))
     with pytest.raises(InputError, match=r"room\.map: is not a map file or is damaged"):
         load_map(path, CAMERA, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("stored", "own", "enabled", "expected"),
+    [
+        (Readout(0.021, 3e6), None, False, GLOBAL_SHUTTER),
+        (Readout(0.021, 3e6), 0.015, True, Readout(0.015, math.inf)),
+        (Readout(0.021, math.inf), None, True, Readout(0.021, CONFIG.rolling_shutter.readout_sigma**-2)),
+        (Readout(0.021, 3e6), None, True, Readout(0.021, 3e6)),
+    ],
+    ids=["disabled", "stated by the camera", "known only to the map", "estimated"],
+)
+def test_readout_of_a_loaded_map_is_that_of_the_run(
+    stored: Readout, own: float | None, enabled: bool, expected: Readout, tmp_path: Path
+) -> None:
+    original = random_map().map
+    original.readout = stored
+    original.observations["readout_jacobian"][:] = torch.tensor([100.0, -50.0])
+    path = write_map(tmp_path, StoredMap(original, StaticViews(CAMERA, CONFIG.dense_map.stride)))
+    overrides = ["segmentation.source=none", f"rolling_shutter.enabled={str(enabled).lower()}"]
+    loaded = load_map(path, replace(CAMERA, readout=own), load_config(overrides=overrides)).map
+    assert loaded.readout == expected
+    shift = (expected.seconds - stored.seconds) * original.observations["readout_jacobian"]
+    torch.testing.assert_close(loaded.observations["uv"], original.observations["uv"] + shift, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("version", [3, 6])

@@ -88,6 +88,9 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
 def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     """Read a map file.
 
+    The readout is that of the camera file, or 0 if the compensation is disabled; else the readout of the map, which is
+    calibrated further. The stored features are shifted accordingly.
+
     Args:
         path: Path of a file written by `save_map`, of this or the previous version of the format.
         camera: Camera of the current run, which must be the camera of the map.
@@ -105,6 +108,8 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     if (problem := find_inconsistency(columns, stored.map, stored.views)) is not None:
         raise InputError(f"{path}: is a damaged map file ({problem}); {_FIX}")
     fill_from_columns(columns, stored.map, stored.views)
+    own = Readout.from_camera(camera, config.rolling_shutter)
+    stored.map.set_readout(stored.map.readout.continued(own))
     return stored
 
 

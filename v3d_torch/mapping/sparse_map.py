@@ -45,8 +45,7 @@ class SparseMap(MapTables):
             camera: Camera of the frames.
         """
         sparse_map = cls(config.mapping, config.features, camera)
-        if config.rolling_shutter.enabled:
-            sparse_map.readout = Readout.from_camera(camera, config.rolling_shutter)
+        sparse_map.readout = Readout.from_camera(camera, config.rolling_shutter)
         return sparse_map
 
     def insert_keyframe(

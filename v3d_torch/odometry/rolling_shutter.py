@@ -49,16 +49,28 @@ class Readout:
         return self.information**-0.5
 
     @classmethod
-    def from_camera(cls, camera: PinholeCamera, prior: RollingShutterConfig) -> Readout:
-        """The camera's readout if it is known, else the prior.
+    def from_camera(cls, camera: PinholeCamera, config: RollingShutterConfig) -> Readout:
+        """The camera's readout if it is known, else the expected one; 0 if the compensation is disabled.
 
         Args:
             camera: Camera, with or without a readout.
-            prior: Expected readout and its standard deviation.
+            config: Expected readout and its standard deviation, and whether it is used.
         """
+        if not config.enabled:
+            return GLOBAL_SHUTTER
         if camera.readout is not None:
             return cls(camera.readout, math.inf)
-        return cls(prior.readout, prior.readout_sigma**-2)
+        return cls(config.readout, config.readout_sigma**-2)
+
+    def continued(self, own: Readout) -> Readout:
+        """Readout of a run that continues with the map of a run with this readout.
+
+        Args:
+            own: Readout of the new run before its first frame.
+        """
+        if own.is_certain:
+            return own
+        return Readout(self.seconds, own.information) if self.is_certain else self
 
     @classmethod
     def from_dict(cls, attributes: Mapping[str, float]) -> Readout:
