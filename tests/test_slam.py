@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_sequence
+from v3d_torch.backend.back_end import BackEndResult
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import ConfigError, InputError
@@ -267,6 +268,40 @@ def test_objects_seen_by_a_lost_camera_move_into_the_map_when_it_is_found() -> N
     assert found.keys() >= {0.8, 0.9, 1.0} and found.keys() == plain.keys()
     for stamp, centroid in found.items():
         torch.testing.assert_close(centroid, plain[stamp], rtol=0, atol=0.03)
+
+
+def test_loop_closed_after_an_unmeasured_motion_corrects_objects_once() -> None:
+    walk, loop_frame = Walk(), 10
+
+    def places(T_new_old: Tensor) -> dict[float, Tensor]:
+        """Return the centroids of the person by their times, if a loop moves the map when a frame is tracked."""
+        slam = V3DSLAM(WALK_CAMERA, UprightSegmenter(segment_red), WALK_CONFIG)
+        odometry, apply = slam.odometry, slam.back_end.apply
+
+        def interrupt(previous: TrackedFrame | None, current: TrackedFrame, *rest: Any) -> CameraMotion:
+            motion = odometry(previous, current, *rest)
+            return replace(motion, is_measured=motion.is_measured and current.frame.index != loop_frame)
+
+        def close_loop(result: BackEndResult) -> Tensor | None:
+            apply(result)
+            if len(slam.poses) != loop_frame:
+                return None
+            slam.map.move_keyframes(slam.map.T_cw @ invert(T_new_old))
+            return T_new_old
+
+        slam.odometry = interrupt
+        slam.back_end.apply = close_loop  # type: ignore[method-assign]
+        statuses = [slam(walk[index]).status for index in range(loop_frame + 1)]
+        assert statuses[-1] is TrackingStatus.TRACKED
+        people = [track for track in slam.classify_motion.tracker.tracks if track.label == PERSON]
+        return {detection.stamp: detection.centroid for track in people for detection in track.detections}
+
+    T_new_old = se3_exp(torch.tensor([0.8, 0.0, 0.4, 0.0, 0.2, 0.0], dtype=torch.float64))
+    plain, corrected = places(torch.eye(4, dtype=torch.float64)), places(T_new_old)
+    assert corrected.keys() >= {0.9, 1.0} and corrected.keys() == plain.keys()
+    for stamp, centroid in corrected.items():
+        expected = T_new_old[:3, :3] @ plain[stamp] + T_new_old[:3, 3]
+        torch.testing.assert_close(centroid, expected, rtol=0, atol=0.01)
 
 
 def test_array_instead_of_a_frame_is_rejected(demo: RGBDSequence) -> None:

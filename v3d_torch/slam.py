@@ -235,7 +235,7 @@ class V3DSLAM(FramePreprocessor):
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
-            keyframe = self._extend_map(frame, static, pose, motion, view)
+            keyframe = self._extend_map(frame, static, pose, motion)
             has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
@@ -335,10 +335,11 @@ class V3DSLAM(FramePreprocessor):
         return instances.concatenate(self.propose_unlabelled(occupied, instances, view.depth))
 
     def _extend_map(
-        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion, view: DepthView
+        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
     ) -> Keyframe | None:
         """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
         part, reference = self.poses.part, self.track_camera.reference_keyframe(pose)
+        predicted_T_cw = self._compose_pose(motion)  # with the corrections of the world since the objects were measured
         keyframe = self.mapper(frame, features, pose, reference)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
         self._apply_world_correction(T_new_old)
@@ -346,7 +347,7 @@ class V3DSLAM(FramePreprocessor):
         if is_elsewhere:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
         if pose.status is not TrackingStatus.LOST and T_new_old is None:
-            self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ view.T_cw, all_tracks=is_elsewhere)
+            self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ predicted_T_cw, all_tracks=is_elsewhere)
         self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)
