@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.bag_messages import matrix_of
+from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import OutputError
-from v3d_torch.export.ros.messages import camera_info, header, occupancy_grid, odometry, path, transforms
+from v3d_torch.export.ros.messages import camera_info, header, occupancy_grid, odometry, path, pose, transforms
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
@@ -65,6 +67,19 @@ def test_transforms_and_path_have_the_given_poses() -> None:
     assert [each.header.stamp.sec for each in line.poses] == [1, 2]
     assert {line.header.frame_id, *(each.header.frame_id for each in line.poses)} == {"map"}
     np.testing.assert_allclose([matrix_of(each.pose) for each in line.poses], T, atol=1e-12)
+
+
+def test_quaternions_of_a_path_are_computed_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = se3_exp(torch.randn(50, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    expected, shapes, from_matrix = [pose(each) for each in many], [], Rotation.from_matrix
+
+    def recorded(matrix: NDArray[np.float64]) -> Rotation:
+        shapes.append(matrix.shape)
+        return from_matrix(matrix)
+
+    monkeypatch.setattr(Rotation, "from_matrix", recorded)
+    assert [each.pose for each in path(2.5, "map", [1.0] * 50, many).poses] == expected
+    assert shapes == [(50, 3, 3)]
 
 
 def test_occupancy_grid_has_its_cells_row_by_row_and_the_pose_of_the_corner_of_the_first_one() -> None:

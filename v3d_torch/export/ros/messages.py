@@ -70,7 +70,7 @@ def vector(components: Tensor) -> ros.geometry_msgs__msg__Vector3:
 
 def pose(T: Tensor) -> ros.geometry_msgs__msg__Pose:
     """Make a pose from a transform, shape :math:`(4, 4)`, to the frame of the header."""
-    return ros.geometry_msgs__msg__Pose(point(T[:3, 3]), _quaternion(T))
+    return _poses(T[None])[0]
 
 
 def transforms(stamp: float, T: dict[tuple[str, str], Tensor]) -> ros.tf2_msgs__msg__TFMessage:
@@ -84,7 +84,7 @@ def transforms(stamp: float, T: dict[tuple[str, str], Tensor]) -> ros.tf2_msgs__
         ros.geometry_msgs__msg__TransformStamped(
             header(stamp, parent),
             child,
-            ros.geometry_msgs__msg__Transform(vector(T_pc[:3, 3]), _quaternion(T_pc)),
+            ros.geometry_msgs__msg__Transform(vector(T_pc[:3, 3]), pose(T_pc).orientation),
         )
         for (parent, child), T_pc in T.items()
     ]
@@ -130,8 +130,8 @@ def path(stamp: float, frame: str, stamps: Sequence[float], T: Tensor) -> ros.na
         T: Poses in the frame, float64, shape :math:`(N, 4, 4)`.
     """
     poses = [
-        ros.geometry_msgs__msg__PoseStamped(header(pose_stamp, frame), pose(T_each))
-        for pose_stamp, T_each in zip(stamps, T, strict=True)
+        ros.geometry_msgs__msg__PoseStamped(header(pose_stamp, frame), each)
+        for pose_stamp, each in zip(stamps, _poses(T), strict=True)
     ]
     return ros.nav_msgs__msg__Path(header(stamp, frame), poses)
 
@@ -183,9 +183,15 @@ def occupancy_grid(stamp: float, frame: str, grid: OccupancyGrid, T_fw: Tensor) 
     )
 
 
-def _quaternion(T: Tensor) -> ros.geometry_msgs__msg__Quaternion:
-    x, y, z, w = Rotation.from_matrix(T[:3, :3].numpy()).as_quat(canonical=True).tolist()
-    return ros.geometry_msgs__msg__Quaternion(x, y, z, w)
+def _poses(T: Tensor) -> list[ros.geometry_msgs__msg__Pose]:
+    """Make poses (N, 4, 4) together: a call of scipy takes as long for one as for a hundred."""
+    quaternions = Rotation.from_matrix(T[:, :3, :3].numpy()).as_quat(canonical=True).tolist()
+    return [
+        ros.geometry_msgs__msg__Pose(
+            ros.geometry_msgs__msg__Point(*position), ros.geometry_msgs__msg__Quaternion(*quaternion)
+        )
+        for position, quaternion in zip(T[:, :3, 3].tolist(), quaternions, strict=True)
+    ]
 
 
 def _flatten(matrix: Tensor) -> NDArray[np.float64]:
