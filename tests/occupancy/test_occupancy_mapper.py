@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from torch import Tensor
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.io.state_file import read_state, write_state
+from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
@@ -121,14 +123,29 @@ def test_correction_during_a_rebuild_is_applied_afterwards() -> None:
     assert same_map(drive.mapper.map, truth.mapper.map)
 
 
+def follow(mapper: OccupancyMapper, T_wc: Tensor, depth: Callable[[Tensor], Tensor]) -> tuple[PoseHistory, Keyframe]:
+    """Add frames at poses, (N, 4, 4), which are relative to one keyframe; `depth` renders the image of a pose."""
+    start, poses = keyframe(HERE), PoseHistory()
+    for index, T in enumerate(T_wc):
+        pose = FramePose(TrackingStatus.TRACKED, invert(T), torch.zeros(1).long())
+        poses.append(index / 30, pose, MOTION, start, None)
+        mapper(depth(T), ALL, poses)
+    return poses, start
+
+
+def corridor(T_wc: Tensor) -> Tensor:
+    """Depth image of a long corridor along z, which is 3.06 m wide, metres, (1, H, W)."""
+    origin, direction = T_wc[:3, 3], CAMERA.rays.to(torch.float64) @ T_wc[:3, :3].T
+    walls = (0, 1.53), (0, -1.53), (1, 1.23), (1, -1.33)
+    sides = [(wall - origin[axis]) / direction[..., axis] for axis, wall in walls]
+    return torch.stack([torch.where(depth > 0, depth, torch.inf) for depth in sides]).amin(dim=0)[None].float()
+
+
 def test_places_of_removed_views_stay_in_the_map_after_a_correction() -> None:
     mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 20}), CAMERA)
-    start, poses = keyframe(HERE), PoseHistory()
-    for index in range(40):  # along a wall
-        T_cw = HERE.clone()
-        T_cw[0, 3] = -0.6 * index
-        poses.append(index / 30, FramePose(TrackingStatus.TRACKED, T_cw, torch.zeros(1).long()), MOTION, start, None)
-        mapper(torch.full((1, CAMERA.height, CAMERA.width), 2.0), ALL, poses)
+    along_wall = HERE.repeat(40, 1, 1)
+    along_wall[:, 0, 3] = 0.6 * torch.arange(40)
+    poses, start = follow(mapper, along_wall, lambda _: torch.full((1, CAMERA.height, CAMERA.width), 2.0))
     assert len(mapper._store) <= 20
     before = mapper.map.occupied_points[:, 0]
     start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.0, 0.04, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
@@ -137,6 +154,20 @@ def test_places_of_removed_views_stay_in_the_map_after_a_correction() -> None:
     assert float(before.max() - before.min()) > 24
     assert abs(float(after.min() - before.min())) < 0.1 and abs(float(after.max() - before.max())) < 0.1
     assert len(after.div(0.4).floor().unique()) == len(before.div(0.4).floor().unique())  # without gaps
+
+
+def test_walls_that_the_remaining_views_hardly_see_stay_in_the_map_after_a_correction() -> None:
+    mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 45, "stride": 12}), CAMERA)
+    twists = torch.zeros(130, 6, dtype=torch.float64)
+    twists[:, 4] = torch.arange(130) % 9 * (2 * torch.pi / 9)
+    along_corridor = se3_exp(twists)
+    along_corridor[:, 2, 3] = 0.15 * torch.arange(130)
+    poses, start = follow(mapper, along_corridor, corridor)
+    before = mapper.map.occupied_points[:, 2]
+    start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.03, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    mapper.correct(poses)
+    metres = [points.histc(bins=20, min=0, max=20) for points in (before, mapper.map.occupied_points[:, 2])]
+    assert mapper._store.has_removed_far and (metres[1] > metres[0] / 2).all()
 
 
 def test_number_of_stored_views_is_bounded_also_during_a_rebuild() -> None:

@@ -80,6 +80,20 @@ def test_kept_and_restored_blocks_have_the_same_log_odds() -> None:
     assert torch.equal(restored.log_odds, before["log_odds"]) and len(restored) == len(mask)
 
 
+def test_blocks_are_adopted_from_a_grid_that_knows_twice_as_many_of_their_voxels() -> None:
+    known = torch.tensor([[10, 10, 10, 0], [19, 20, 0, 5]])  # of four blocks, in each grid; 0: the block does not exist
+    grids = VoxelBlocks(), VoxelBlocks()
+    for grid, counts, mark in zip(grids, known, (1, HIT), strict=True):
+        rows = counts.nonzero()[:, 0]
+        marks = torch.where(torch.arange(VOLUME) < counts[rows, None], mark, 0).to(torch.uint8)
+        grid.add(Observations(torch.stack([rows, -rows, rows], dim=1), marks), MODEL)
+    own, other = grids
+    own.adopt_better_known(other)
+    voxels = SIDE * torch.tensor([[row, -row, row] for row in range(4)])
+    assert own.log_odds_at(voxels).tolist() == [MODEL.miss, MODEL.hit, MODEL.miss, MODEL.hit]
+    assert own.count_known()[own.find(voxels >> BITS)].tolist() == [10, 20, 10, 5]
+
+
 def test_sensor_model_has_the_probabilities_of_the_configuration() -> None:
     config = OccupancyConfig()
     probability = torch.tensor([MODEL.hit, MODEL.miss, MODEL.minimum, MODEL.maximum], dtype=torch.float64)

@@ -97,13 +97,18 @@ class VoxelBlocks:
         """Remove all blocks except those in a bool mask; the others keep their order."""
         self.load_state_dict({"coordinates": self.coordinates[mask], "log_odds": self.log_odds[mask]})
 
-    def add_missing(self, other: VoxelBlocks) -> None:
-        """Add the blocks of another grid that do not exist in this one."""
+    def count_known(self) -> Tensor:
+        """Number of voxels of each block that were observed, int64, shape :math:`(N,)`."""
+        return torch.cat([(part.log_odds != UNKNOWN).sum(dim=1) for part in self.parts()])
+
+    def adopt_better_known(self, other: VoxelBlocks) -> None:
+        """Take blocks from another grid: those that only it has, and those of which it knows twice as many voxels."""
         missing = self.find(other.coordinates) < 0
         if bool(missing.any()):
-            first = len(self)
             self._append(other.coordinates[missing])
-            self._log_odds[first : len(self)] = other.log_odds[missing]
+        slots = self.find(other.coordinates)
+        better = other.count_known() >= 2 * self.count_known()[slots]
+        self._log_odds[slots[better]] = other.log_odds[better]
 
     def parts(self) -> Iterator[VoxelBlocks]:
         """Yield parts with some of the blocks each, in their order, so that work on all voxels needs little memory.
