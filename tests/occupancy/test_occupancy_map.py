@@ -243,6 +243,16 @@ def test_distances_follow_the_map() -> None:
     assert occupancy.distance(point) < before - 0.3
 
 
+def test_depth_beyond_the_range_of_stored_views_shows_the_same_free_space() -> None:
+    maps = [OccupancyMap(CONFIG) for _ in range(2)]
+    for occupancy, depth in zip(maps, (12.0, 20.0), strict=True):
+        view = RangeView.sample(0, torch.full((CAMERA.height, CAMERA.width), depth), ALL, CONFIG.stride)
+        occupancy.integrate(view.depth, view.static, view.rays(CAMERA, CONFIG.stride), EYE)
+    near, far = maps
+    assert torch.equal(far.free_points, near.free_points) and len(far.free_points) > 1000
+    assert len(far.occupied_points) == 0
+
+
 # --- memory
 
 

@@ -33,12 +33,14 @@ def store_of(capacity: int, *x: float) -> ViewStore:
 def test_samples_have_the_depth_and_ray_of_their_pixels() -> None:
     depth = torch.rand(240, 320, generator=torch.Generator().manual_seed(0)) * 4
     depth[::7] = 0.0
-    depth[5, 5] = 20.0  # beyond the range of the stored units
+    depth[5:8, 5:8] = 20.0  # beyond the range of the stored units
+    depth[::11] = torch.inf
+    depth[::13] = torch.nan
     for number in range(5):
         view = RangeView.sample(number, depth, ALL, 8)
         assert view.depth.shape == view.static.shape == (30, 40) and view.static.all()
         picked = depth[view.row :: 8, view.column :: 8]
-        expected = torch.where(picked < 2**16 * UNIT, picked, 0)
+        expected = torch.where(picked.isfinite(), picked.clamp(max=(2**16 - 1) * UNIT), 0)
         torch.testing.assert_close(view.depth, expected, rtol=0, atol=UNIT / 2 + 1e-6)
         assert torch.equal(view.rays(CAMERA, 8), CAMERA.rays[view.row :: 8, view.column :: 8])
 

@@ -14,6 +14,9 @@ from v3d_torch.geometry.camera import PinholeCamera
 UNIT = 0.0002
 """Unit of stored depth, metres, the same as in `StaticViews`."""
 
+_MAX_UNITS = 2**16 - 1
+"""Maximum stored depth, 13.1 m: rays are cast up to 10 m at most, so a larger depth shows the same free space."""
+
 _STEPS = 0.7548776662466927, 0.5698402909980532
 """Steps of a quasirandom sequence of offsets, which covers the square evenly from the first elements on (Roberts, "The
 unreasonable effectiveness of quasirandom sequences", 2018), so that all pixels are used over time."""
@@ -26,7 +29,7 @@ class RangeView:
     Attributes:
         row: First row.
         column: First column.
-        depth_units: Depth in units of `UNIT`, 0 = no measurement, uint16, shape :math:`(h, w)`.
+        depth_units: Depth in units of `UNIT`, at most 13.1 m, 0 = no measurement, uint16, shape :math:`(h, w)`.
         static: Mask of samples that are static and whose neighbours are static, bool, shape :math:`(h, w)`: masks are
             inaccurate by some pixels, so samples next to a moving object can belong to it.
     """
@@ -48,7 +51,7 @@ class RangeView:
         """
         row, column = (int(stride * math.modf((number + 1) * step)[0]) for step in _STEPS)
         units = (_samples(depth, row, column, stride) / UNIT).round()
-        units = torch.where(units < 2**16, units, 0).to(torch.uint16)
+        units = torch.where(units.isfinite(), units.clamp(max=_MAX_UNITS), 0).to(torch.uint16)
         moving = ~_samples(static, row, column, stride)
         near_moving = max_pool2d(moving[None].to(torch.float32), 3, 1, 1)[0] > 0
         return RangeView(row, column, units, ~near_moving)
