@@ -17,7 +17,7 @@ from threading import Thread
 import message_filters
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.wait_for_message import wait_for_message
 from rosbags.typesys import Stores, get_typestore
 from rosidl_runtime_py.utilities import get_message
@@ -29,6 +29,7 @@ from v3d_torch.export.ros.run_messages import Message, RunMessages
 
 COLOUR, DEPTH, INFO = "camera/color/image_raw", "camera/aligned_depth_to_color/image_raw", "camera/color/camera_info"
 GRID_INTERVAL = 90  # tracked frames between two grids: a grid takes a tenth of a second
+QOS = {"/map": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)}  # as nav2 subscribes to it
 
 
 class SlamNode(Node):
@@ -40,8 +41,7 @@ class SlamNode(Node):
         overrides = self.declare_parameter("set", ["occupancy.enabled=true"]).value
         _, info = wait_for_message(CameraInfo, self, INFO)
         pinhole = *info.k[[0, 4, 2, 5]], info.width, info.height, tuple(info.d)
-        units = 1000  # REP 118: millimetres
-        self.camera = v3d.PinholeCamera(*pinhole, depth_scale=units, distortion_model=info.distortion_model)
+        self.camera = v3d.PinholeCamera(*pinhole, depth_scale=1000, distortion_model=info.distortion_model)  # REP 118
         self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
         self._count = 0
@@ -83,7 +83,7 @@ class SlamNode(Node):
 
     def _publish(self, topic: str, message: Message) -> None:
         if topic not in self._topics:
-            self._topics[topic] = self.create_publisher(get_message(message.__msgtype__), topic, 10)
+            self._topics[topic] = self.create_publisher(get_message(message.__msgtype__), topic, QOS.get(topic, 10))
         self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
 
 

@@ -89,6 +89,12 @@ def test_node_publishes_poses_path_and_clouds_in_the_types_of_ros(ros: FakeROS) 
     assert len(ros.published["/path"]) == len(ros.published["/cloud"]) >= 2
 
 
+def test_map_is_kept_for_nodes_that_subscribe_later(ros: FakeROS) -> None:
+    """The map server of nav2 publishes so, and the costmaps of nav2 receive the map of no other publisher."""
+    assert ros.qos.pop("/map") == {"depth": 1, "durability": "transient local"}
+    assert set(ros.qos.values()) == {10}
+
+
 def test_odometry_follows_the_camera_to_the_right(ros: FakeROS) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     poses = [store.deserialize_cdr(message, kind) for kind, message in ros.published["/odom"]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 Pair = tuple[Any, Any]
@@ -21,12 +21,14 @@ class FakeROS:
 
     Attributes:
         published: Type and serialised messages of each topic.
+        qos: Quality of service of each published topic, or the depth of its queue.
         subscribed: Topics of the images.
         warnings: Warnings of the node.
     """
 
     def __init__(self, info: Any, images: Callable[[Any], Iterable[Pair]], parameters: dict[str, Any]) -> None:
         self.published: dict[str, list[tuple[str, bytes]]] = defaultdict(list)
+        self.qos: dict[str, Any] = {}
         self.subscribed: list[str] = []
         self.warnings: list[str] = []
         self._info, self._images, self._parameters = info, images, parameters
@@ -52,10 +54,12 @@ class FakeROS:
 
                 return Logger
 
-            def create_publisher(self, kind: str, topic: str, depth: int) -> Any:
+            def create_publisher(self, kind: str, topic: str, qos: Any) -> Any:
+                ros.qos[topic] = qos
+
                 class Publisher:
                     def publish(self, message: bytes) -> None:
-                        assert isinstance(message, bytes) and depth > 0
+                        assert isinstance(message, bytes)
                         ros.published[topic].append((kind, message))
 
                 return Publisher()
@@ -79,7 +83,11 @@ class FakeROS:
         contents: dict[str, dict[str, Any]] = {
             "rclpy": {"init": lambda: None, "spin": spin},
             "rclpy.node": {"Node": Node},
-            "rclpy.qos": {"qos_profile_sensor_data": object()},
+            "rclpy.qos": {
+                "DurabilityPolicy": SimpleNamespace(TRANSIENT_LOCAL="transient local"),
+                "QoSProfile": dict,
+                "qos_profile_sensor_data": object(),
+            },
             "rclpy.wait_for_message": {"wait_for_message": lambda kind, node, topic: (True, self._info)},
             "message_filters": {"Subscriber": subscriber, "ApproximateTimeSynchronizer": Synchronizer},
             "rosidl_runtime_py": {},

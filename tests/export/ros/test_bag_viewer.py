@@ -22,6 +22,7 @@ from helpers.bag_messages import (
 from helpers.squares import squares
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
 from mcap.reader import make_reader
+from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
 
 from v3d_torch.config.loading import load_config
@@ -29,8 +30,10 @@ from v3d_torch.errors import OutputError
 from v3d_torch.export.ros.bag_file import BagFile
 from v3d_torch.export.ros.bag_viewer import BagViewer
 from v3d_torch.export.ros.frames import camera_in_map, map_frame, points_in_map
+from v3d_torch.export.ros.messages import occupancy_grid, transforms
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.slam import V3DSLAM
@@ -91,6 +94,23 @@ def test_file_states_profile_schemas_and_encodings_of_ros2(recorded: Recorded) -
             "/path": recorded.keyframes + 1,
             "/cloud_map": 1,
         }
+
+
+def test_map_is_played_to_subscribers_that_start_later_also_by_distributions_after_humble(tmp_path: Path) -> None:
+    """The topic of the map of nav2 has the durability that nav2 requests; other topics have that of most publishers."""
+    path, grid = tmp_path / "run.mcap", OccupancyGrid(torch.zeros(2, 3, dtype=torch.int8), 0.05, (0, 0), AS_SEEN, 0)
+    bag = BagFile(path)
+    bag.write("/map", occupancy_grid(1.0, "map", grid, AS_SEEN), 1)
+    bag.write("/tf", transforms(1.0, {}), 1)
+    bag.close()
+    with Reader(path) as reader:
+        profiles = {each.topic: each.ext.offered_qos_profiles for each in reader.connections}
+    assert profiles["/tf"] == []
+    assert [(each.durability, each.reliability) for each in profiles["/map"]] == [
+        (QosDurability.TRANSIENT_LOCAL, QosReliability.RELIABLE)
+    ]
+    with path.open("rb") as file:  # without this record, they expect names instead of numbers
+        assert [each.name for each in make_reader(file).iter_metadata()] == ["rosbag2"]
 
 
 def test_times_are_those_of_the_frames_and_never_decrease(messages: Messages) -> None:

@@ -12,6 +12,28 @@ from rosbags.typesys import Stores, get_typestore
 from v3d_torch.errors import OutputError
 from v3d_torch.export.ros.run_messages import Message
 
+_TRANSIENT_LOCAL = """\
+- history: 3
+  depth: 0
+  reliability: 1
+  durability: 1
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+"""Quality of service of a publisher whose last message new subscribers receive, as the recorder of ROS 2 Humble writes
+it: ``ros2 bag play`` publishes with the recorded one."""
+
+_QUALITY_OF_SERVICE = {"/map": _TRANSIENT_LOCAL}
+"""Quality of service of topics whose subscribers expect another one than the default, here those of nav2."""
+
 
 class BagFile:
     """Writer of a bag. Messages are written immediately; ``mcap recover`` repairs a file that was not closed.
@@ -31,6 +53,8 @@ class BagFile:
             self._file: BinaryIO = path.open("xb")
             self._writer = Writer(self._file)
             self._writer.start("ros2", f"v3d-torch {version('v3d-torch')}")
+            # Later distributions read numbers as qualities of service only in files with this record of the recorder.
+            self._writer.add_metadata("rosbag2", {"ROS_DISTRO": "humble"})
         except OSError as error:
             raise self._error(error) from error
         self._schemas: dict[str, int] = {}
@@ -64,7 +88,8 @@ class BagFile:
             definition, _ = self._store.generate_msgdef(kind, ros_version=2)
             self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition.encode())
         if topic not in self._channels:
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
+            quality = {"offered_qos_profiles": _QUALITY_OF_SERVICE.get(topic, "")}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], quality)
         return self._channels[topic]
 
     def _error(self, error: OSError) -> OutputError:
