@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
-from helpers.wall_run import FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
+import torch
+from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline.run_record import Snapshot
 from v3d_torch.runs.results import write_results
 from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
@@ -47,6 +53,17 @@ def test_callback_and_record_have_every_frame_and_object() -> None:
     assert len(record.snapshots) == 6
     assert set(pipeline.slam.timer.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
     assert max(pipeline.slam.timer.seconds.values()) <= record.seconds
+
+
+def test_snapshots_of_a_stream_that_drops_frames_reach_from_its_first_to_its_last_frames() -> None:
+    wall, mask = Wall(), torch.ones(240, 320, dtype=torch.bool)
+    frame, nothing = wall[0], cast("FrameResult", FrameObjects([], mask, mask, []))
+    pipeline = Pipeline(RealtimePlayback(wall), V3DSLAM(CAMERA, square))
+    for number in range(900):
+        pipeline.slam = cast("V3DSLAM", SimpleNamespace(poses=range(number + 1)))
+        pipeline._keep_snapshot(Snapshot(replace(frame, index=2 * number + 1), torch.eye(4), nothing))
+    kept = [snapshot.frame.index // 2 for snapshot in pipeline.record.snapshots]
+    assert kept == list(range(0, 900, 128))
 
 
 @pytest.mark.parametrize("broken", [0, 1, 5])

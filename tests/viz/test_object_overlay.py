@@ -61,6 +61,13 @@ def test_at_most_six_frames_in_rows_of_three(tmp_path: Path, number: int, column
     assert width / height == pytest.approx(4 * columns / (3 * rows + 0.4), rel=0.01)
 
 
+@pytest.mark.parametrize(("number", "drawn"), [(7, "0 1 2 4 5 6"), (12, "0 2 4 7 9 11")])
+def test_frames_from_the_first_to_the_last_are_drawn(tmp_path: Path, number: int, drawn: str) -> None:
+    images, masks = frames(number)
+    save_mask_figure(images, [[(mask, str(i), "static")] for i, mask in enumerate(masks)], tmp_path / "masks.svg")
+    assert re.findall(r"<!-- (\d+) -->", (tmp_path / "masks.svg").read_text()) == drawn.split()
+
+
 def test_objects_out_of_view_have_no_label_and_missing_arguments_are_errors(tmp_path: Path) -> None:
     images, masks = frames(2)
     save_mask_figure(images, [[(torch.zeros_like(masks[0]), "person 1", "dynamic")], []], tmp_path / "masks.svg")

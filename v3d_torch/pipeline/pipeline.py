@@ -321,19 +321,22 @@ class Pipeline:
         self.record.was_checked = True
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep the most dynamic frame, and frames at equal intervals, which increase during a live stream."""
+        """Keep the most dynamic frame, and frames at equal intervals, which increase during a live stream.
+
+        Intervals are numbers of tracked frames, because a live stream drops frames irregularly.
+        """
         best = self.record.most_dynamic_snapshot
         if best is None or _dynamic_votes(snapshot.result) > _dynamic_votes(best.result):
             self.record.most_dynamic_snapshot = snapshot
-        snapshots = self.record.snapshots
+        snapshots, number = self.record.snapshots, len(self.slam.poses) - 1
         if isinstance(self.sequence, Sized):
             step = max(len(self.sequence) // _SNAPSHOTS, 1)
-            wanted = snapshot.frame.index % step == step // 2 and len(snapshots) < _SNAPSHOTS
+            wanted = number % step == step // 2 and len(snapshots) < _SNAPSHOTS
         else:
             if len(snapshots) == 2 * _SNAPSHOTS:
                 del snapshots[1::2]
                 self._snapshot_step *= 2
-            wanted = snapshot.frame.index % self._snapshot_step == 0
+            wanted = number % self._snapshot_step == 0
         if wanted:
             snapshots.append(snapshot)
 

@@ -43,7 +43,7 @@ def save_mask_figure(images: Sequence[Tensor], overlays: Sequence[Sequence[Overl
     """Write a grid of frames with the masks of their objects, coloured by motion state.
 
     Args:
-        images: Frames, uint8 RGB, shape :math:`(3, H, W)` each; the first six are drawn.
+        images: Frames, uint8 RGB, shape :math:`(3, H, W)` each; of more than six, six at equal intervals are drawn.
         overlays: Objects of each frame: mask (bool, shape :math:`(H, W)`), label and motion state.
         path: Image file; the suffix (.png, .pdf, .svg) selects the format.
 
@@ -53,7 +53,9 @@ def save_mask_figure(images: Sequence[Tensor], overlays: Sequence[Sequence[Overl
     """
     if not images:
         raise ValueError("a figure of masks needs at least one image")
-    frames = list(zip(images, overlays, strict=True))[:_MAX_FRAMES]
+    frames = list(zip(images, overlays, strict=True))
+    if len(frames) > _MAX_FRAMES:
+        frames = [frames[row] for row in np.linspace(0, len(frames) - 1, _MAX_FRAMES).round().astype(int)]
     columns = min(_COLUMNS, len(frames))
     rows = -(-len(frames) // columns)
     height, width = images[0].shape[1:]
