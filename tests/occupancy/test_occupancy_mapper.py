@@ -233,3 +233,19 @@ def test_floor_is_searched_again_when_the_number_of_views_has_doubled(monkeypatc
     assert searched == [16, 32, 64] and found == [None] * 31 + [0] * 32 + [1] * 7
     drive.mapper.correct(drive.poses)  # finds none, and keeps the last one
     assert len(searched) == 4 and drive.mapper.floor is not None
+
+
+def test_unknown_floor_is_searched_every_32_views(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It becomes visible after 70 views."""
+    drive, searched = Drive(OccupancyMapper(CONFIG.model_copy(update={"stride": 60}), CAMERA)), []
+    floor = Floor(-torch.eye(3, dtype=torch.float64)[1], 0.0, 1.0)
+
+    def find_floor() -> Floor | None:
+        searched.append(len(drive.entries))
+        return floor if len(drive.entries) > 70 else None
+
+    monkeypatch.setattr(drive.mapper, "find_floor", find_floor)
+    drive.add(0, 95)
+    assert drive.mapper.floor is None
+    drive.add(95, 170)
+    assert drive.mapper.floor is floor and searched == [16, 32, 64, 96, 128]

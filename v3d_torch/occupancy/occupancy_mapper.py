@@ -32,6 +32,9 @@ _FIRST_SEARCH = 16
 """Number of views after which the floor is first searched: a second and a half. It is searched again whenever their
 number has doubled, because a search takes up to a tenth of a second."""
 
+_SEARCH_INTERVAL = 32
+"""Number of views between two searches while no floor is known: three seconds. Until then ``map`` of ROS is tilted."""
+
 _REBUILD_VIEWS = 4
 """Number of stored views that are added with each new view during a rebuild, which is spread over many frames."""
 
@@ -91,7 +94,7 @@ class OccupancyMapper:
         if self._rebuilt is None and self._count % _CHECK_INTERVAL == 0:
             self._begin_rebuild(poses)
         self._continue_rebuild(_REBUILD_VIEWS + 1)
-        if self._count >= _FIRST_SEARCH and self._count.bit_count() == 1:
+        if self._is_search_due():
             self.floor = self.find_floor() or self.floor
 
     def find_floor(self) -> Floor | None:
@@ -140,6 +143,12 @@ class OccupancyMapper:
         if state["rebuilt"] is not None:
             self._rebuilt = OccupancyMap(self._config)
             self._rebuilt.load_state_dict(state["rebuilt"])
+
+    def _is_search_due(self) -> bool:
+        """Check whether the floor is searched after this view."""
+        if self.floor is None and self._count % _SEARCH_INTERVAL == 0:
+            return True
+        return self._count >= _FIRST_SEARCH and self._count.bit_count() == 1
 
     def _begin_rebuild(self, poses: PoseHistory) -> None:
         """Begin a rebuild if a view has moved too far."""
