@@ -42,6 +42,7 @@ from v3d_torch.types import RGBDFrame
 
 CONFIG = load_config(overrides=["mapping.max_keyframe_interval=5"])
 AS_SEEN = map_frame(None)
+DELETEALL = 3
 EVERY_FRAME = ("/tf", "/odom", "/camera/color/camera_info", "/objects")
 
 
@@ -246,7 +247,7 @@ def test_map_and_odom_are_level_from_the_first_frame_on_if_gravity_is_measured(t
             np.testing.assert_allclose(gravity, [0, 0, -1], atol=1e-3 if frame == "odom" else 1e-9)
 
 
-def test_lost_camera_has_camera_info_only(tmp_path: Path) -> None:
+def test_lost_camera_has_camera_info_only_and_removes_the_markers_once(tmp_path: Path) -> None:
     class Dark(Wall):
         def __getitem__(self, index: int) -> RGBDFrame:
             frame = super().__getitem__(index)
@@ -255,9 +256,12 @@ def test_lost_camera_has_camera_info_only(tmp_path: Path) -> None:
     run = Recorded(tmp_path / "run.mcap", Dark())
     messages = read_with_mcap(run.path)
     lost = run.pipeline.slam.poses.statuses.count("lost")
-    assert lost > 0
+    assert lost > 1
     assert len(messages["/camera/color/camera_info"]) == FRAMES
     assert len(messages["/tf"]) == len(messages["/odom"]) == FRAMES - lost
+    removed = [[marker.action for marker in array.markers] == [DELETEALL] for _, array in messages["/objects"]]
+    assert removed == (FRAMES - lost) * [False] + [True]
+    assert messages["/objects"][-1][0] == round(1e8 * (FRAMES - lost))
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,15 @@ _MIN_SIZE = 0.02
 _IDENTITY, _UNIT = torch.eye(4, dtype=torch.float64), torch.ones(3)
 
 
+def no_markers(stamp: float) -> ros.visualization_msgs__msg__MarkerArray:
+    """Make the message that removes all markers.
+
+    Args:
+        stamp: Timestamp, seconds.
+    """
+    return _marker_array([_removal(stamp)])
+
+
 def object_markers(
     stamp: float, objects: FrameObjects, up: Tensor, T_mw: Tensor
 ) -> ros.visualization_msgs__msg__MarkerArray:
@@ -46,14 +55,23 @@ def object_markers(
         up: Direction against gravity, world frame, shape :math:`(3,)`.
         T_mw: Transform from the world frame to ``map``, float64, shape :math:`(4, 4)`.
     """
-    markers = [_marker(stamp, "", 0, Marker.CUBE, "unknown", action=Marker.DELETEALL)]
+    markers = [_removal(stamp)]
     boxes = objects.boxes(up)
     for each in objects.objects:
         if each.id in boxes:
             markers += _box_and_name(stamp, each, boxes[each.id], T_mw)
             if each.motion_state is MotionState.DYNAMIC:
                 markers.append(_arrow(stamp, each, T_mw))
+    return _marker_array(markers)
+
+
+def _marker_array(markers: list[Marker]) -> ros.visualization_msgs__msg__MarkerArray:
     return ros.visualization_msgs__msg__MarkerArray(markers)  # type: ignore[arg-type]  # rosbags annotates an old Marker
+
+
+def _removal(stamp: float) -> Marker:
+    """Marker that removes all markers before it."""
+    return _marker(stamp, "", 0, Marker.CUBE, "unknown", action=Marker.DELETEALL)
 
 
 def _box_and_name(stamp: float, each: TrackedObject, box: UprightBox, T_mw: Tensor) -> list[Marker]:

@@ -13,8 +13,9 @@
 ``/map``                          ``nav_msgs/OccupancyGrid``, at the end      the floor, if an occupancy map is grown
 ================================  ==========================================  =====================================
 
-While the camera is lost, only ``/camera/color/camera_info`` has messages. ``map`` turns against ``odom`` when the floor
-has shown where up is; a measured gravity is known at the first frame.
+While the camera is lost, only ``/camera/color/camera_info`` has messages; the first lost frame also removes the markers
+of ``/objects``. ``map`` turns against ``odom`` when the floor has shown where up is; a measured gravity is known at the
+first frame.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.export.ros import frames
-from v3d_torch.export.ros.markers import object_markers
+from v3d_torch.export.ros.markers import no_markers, object_markers
 from v3d_torch.export.ros.messages import camera_info, occupancy_grid, odometry, path, transforms
 from v3d_torch.export.ros.point_cloud import point_cloud
 from v3d_torch.geometry.camera import PinholeCamera
@@ -63,6 +64,7 @@ class RunMessages:
         self._odometry_frame = frames.OdometryFrame()
         self._previous: int | None = None  # position in the pose history
         self._T_mw = frames.map_frame(None)  # as at the last frame
+        self._has_markers = False
 
     def of_frame(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM) -> Iterator[TopicMessage]:
         """Yield the messages of a frame.
@@ -78,10 +80,14 @@ class RunMessages:
         stamp = frame.stamp
         yield "/camera/color/camera_info", camera_info(stamp, frames.OPTICAL, self._camera)
         if slam.poses.status is TrackingStatus.LOST:
+            if self._has_markers:  # viewers would show them until the camera is found
+                yield "/objects", no_markers(stamp)
+                self._has_markers = False
             return
         self._T_mw = frames.map_frame(slam.T_lw)
         yield from self._pose_messages(stamp, slam)
         yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
+        self._has_markers = True
         keyframes = slam.map.keyframes
         if keyframes and keyframes[-1].frame == frame.index:
             yield "/cloud", self._cloud(frame, objects.static_without_people)
