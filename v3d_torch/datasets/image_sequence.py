@@ -39,6 +39,11 @@ class ImageSequence(StoredSequence):
     registration_fix = "export depth that is registered to the colour image"
     """Fix for colour and depth of different sizes, for messages."""
 
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about the sequence that a user needs to know, such as how the depth scale was estimated."""
+        return [] if self.depth_scale_note is None else [self.depth_scale_note]
+
     def check(self, source: object, *, skip_broken: bool = False) -> None:
         """Check that all files exist, and decode the first frame, so that errors are reported before a long run.
 

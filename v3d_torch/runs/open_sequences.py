@@ -30,10 +30,8 @@ def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_b
 
 
 def print_notes(source: RGBDStream, console: Console) -> None:
-    """Print notes on a source: an estimated depth scale, and the memory of a run with large images."""
-    notes = []
-    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
-        notes.append(source.depth_scale_note)
+    """Print notes on a source: those of the sequence, and the memory of a run with large images."""
+    notes = source.notes if isinstance(source, ImageSequence) else []
     width, height = source.camera.width, source.camera.height
     if width * height > _MANY_PIXELS:
         gigabytes = width * height * _BYTES_PER_PIXEL / 1e9

@@ -106,8 +106,8 @@ class Run:
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
-        if isinstance(sequence, ImageSequence) and sequence.depth_scale_note is not None:
-            self.pipeline.warn([sequence.depth_scale_note])
+        if isinstance(sequence, ImageSequence):
+            self.pipeline.warn(sequence.notes)
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"

@@ -89,16 +89,61 @@ def test_unset_header_stamps_are_replaced_by_arrival_times(tmp_path: Path) -> No
 
 
 def test_decreasing_stamps_and_unpaired_images_are_dropped(tmp_path: Path) -> None:
-    messages = valid_messages(ROS2, 2)
-    messages.append((RGB, 11.0, ROS2.image(10.05, "rgb8", colour_of(7))))  # stamped before the previous image
-    messages.append((DEPTH, 11.0, ROS2.image(10.05, "16UC1", depth_of(7))))
-    messages.append((RGB, 11.1, ROS2.image(10.6, "rgb8", colour_of(8))))  # no depth within the tolerance
-    messages.append((DEPTH, 11.2, ROS2.image(10.69, "16UC1", depth_of(9))))
-    messages.append((RGB, 11.3, ROS2.image(10.7, "rgb8", colour_of(9))))  # its depth arrived first
+    messages = valid_messages(ROS2, 12)
+    messages.append((RGB, 12.0, ROS2.image(10.05, "rgb8", colour_of(17))))  # stamped before the previous image
+    messages.append((DEPTH, 12.0, ROS2.image(10.05, "16UC1", depth_of(17))))
+    messages.append((RGB, 12.1, ROS2.image(11.6, "rgb8", colour_of(18))))  # no depth within the tolerance
+    messages.append((DEPTH, 12.2, ROS2.image(11.69, "16UC1", depth_of(19))))
+    messages.append((RGB, 12.3, ROS2.image(11.7, "rgb8", colour_of(19))))  # its depth arrived first
     sequence = load_sequence(str(ROS2.write(tmp_path / "take", messages)))
     assert isinstance(sequence, BagSequence)
-    assert sequence.stamps.tolist() == pytest.approx([10, 10.1, 10.7])
-    assert_frame(sequence, 2, 9)
+    assert sequence.stamps.tolist() == pytest.approx([*(10 + i / 10 for i in range(12)), 11.7])
+    assert_frame(sequence, 12, 19)
+    assert sequence.notes == [
+        f"{RGB}: the stamps jump back from 11.100000 to 10.050000 s after 12 images; 1 of 15 images are left out",
+        f"{DEPTH}: the stamps jump back from 11.104000 to 10.050000 s after 12 images; 1 of 14 images are left out",
+    ]
+
+
+def write_with_stamps(path: Path, stamps: list[float]) -> Path:
+    """Write a bag whose images have these stamps; they arrive a tenth of a second after each other."""
+    messages: list[Message] = [(INFO, 10.0, ROS2.info(WIDTH, HEIGHT, K, D, P))]
+    for i, stamp in enumerate(stamps):
+        messages.append((RGB, 10 + i / 10, ROS2.image(stamp, "rgb8", colour_of(i))))
+        messages.append((DEPTH, 10 + i / 10, ROS2.image(stamp, "16UC1", depth_of(i))))
+    return ROS2.write(path, messages)
+
+
+def test_stamps_of_a_simulation_start_at_zero(tmp_path: Path) -> None:
+    stamps = [i / 10 for i in range(20)]
+    sequence = load_sequence(str(write_with_stamps(tmp_path / "take", stamps)))
+    assert isinstance(sequence, BagSequence)
+    assert sequence.stamps.tolist() == pytest.approx(stamps) and sequence.notes == []
+
+
+def test_images_that_were_published_twice_are_read_once_without_a_note(tmp_path: Path) -> None:
+    sequence = load_sequence(str(write_with_stamps(tmp_path / "take", [1.0, 1.0, 2.0, 2.0, 3.0, 3.0])))
+    assert isinstance(sequence, BagSequence)
+    assert sequence.stamps.tolist() == [1, 2, 3] and sequence.notes == []
+
+
+@pytest.mark.parametrize(
+    ("stamps", "jump", "count"),
+    [
+        ([1.8e9, *(100 + i / 10 for i in range(30))], "1800000000.000000 to 100.000000 s after 1 images", "30 of 31"),
+        (
+            [*(100 + i / 10 for i in range(20)), *(100.9 + i / 10 for i in range(20))],
+            "101.900000 to 100.900000 s after 20 images",
+            "10 of 40",
+        ),
+    ],
+    ids=["one wild first stamp", "set back by a second"],
+)
+def test_clock_that_was_set_back_is_an_input_error(stamps: list[float], jump: str, count: str, tmp_path: Path) -> None:
+    path = write_with_stamps(tmp_path / "take", stamps)
+    with pytest.raises(InputError, match=f"{RGB}: the stamps jump back from {jump}, and {count} images are") as caught:
+        load_sequence(str(path))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 # --- cameras

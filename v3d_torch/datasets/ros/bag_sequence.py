@@ -18,6 +18,7 @@ from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
+from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
 from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
@@ -50,7 +51,7 @@ class BagSequence(ImageSequence):
         progress: Called with the number of messages read so far.
 
     Raises:
-        InputError: If the bag is damaged or has no matching colour, depth and camera.
+        InputError: If the bag is damaged, has no matching colour, depth and camera, or has a clock that was set back.
     """
 
     registration_fix = "choose depth registered to colour with --depth-topic"
@@ -75,7 +76,7 @@ class BagSequence(ImageSequence):
             depth_scale=_DEPTH_SCALE,
             image_size=lambda: _image_size(path, topics),
         )
-        stamps, frame_ids = _index_messages(path, topics, progress)
+        stamps, frame_ids, self._stamp_notes = _index_messages(path, topics, progress)
         depth_frame, colour_frame = frame_ids[topics.depth], frame_ids[topics.rgb]
         is_confirmed = depth_topic is not None or topics.is_registered
         if not is_confirmed and depth_frame and colour_frame and depth_frame != colour_frame:
@@ -104,6 +105,11 @@ class BagSequence(ImageSequence):
         )
         self._read(0)  # raise errors that concern every frame here, and not later
         self.gravity = read_gravity(path, types, partial(_read_messages, path), colour_frame, float(self.stamps[0]))
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about the sequence that a user needs to know, also on images that were left out."""
+        return [*super().notes, *self._stamp_notes]
 
     def _sources(self, index: int) -> tuple[str, str]:
         return f"{self.path}: {self.topics.rgb}", f"{self.path}: {self.topics.depth}"
@@ -181,26 +187,26 @@ def _read_messages(path: Path, *topics: str) -> Iterator[tuple[str, int, Any]]:
 
 def _index_messages(
     path: Path, topics: BagTopics, progress: Progress | None
-) -> tuple[dict[str, dict[float, int]], dict[str, str]]:
+) -> tuple[dict[str, dict[float, int]], dict[str, str], list[str]]:
     """Index the colour and depth messages of a bag.
 
     Returns:
-        For each topic, the message index by stamp (seconds, increasing); and for each topic, its frame_id.
+        For each topic, the message index by stamp (seconds, increasing); for each topic, its frame_id; and sentences on
+        images that were dropped, see `index_by_stamp`.
     """
-    indices: dict[str, dict[float, int]] = {topics.rgb: {}, topics.depth: {}}
-    frame_ids = dict.fromkeys(indices, "")
-    counts = dict.fromkeys(indices, 0)
-    for done, (topic, arrival, message) in enumerate(_read_messages(path, *indices), start=1):
-        topic_indices, index = indices[topic], counts[topic]
-        counts[topic] += 1
+    stamps: dict[str, list[float]] = {topics.rgb: [], topics.depth: []}
+    arrivals: dict[str, list[float]] = {topic: [] for topic in stamps}
+    frame_ids = dict.fromkeys(stamps, "")
+    for done, (topic, arrival, message) in enumerate(_read_messages(path, *stamps), start=1):
+        stamp = message.header.stamp
+        stamps[topic].append(stamp.sec + stamp.nanosec * 1e-9)
+        arrivals[topic].append(arrival * 1e-9)
         frame_ids[topic] = frame_ids[topic] or message.header.frame_id.strip("/")
-        stamp = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9 or arrival * 1e-9
-        # Drop images whose stamps do not increase: the clock was set back.
-        if not topic_indices or stamp > next(reversed(topic_indices)):
-            topic_indices[stamp] = index
         if progress is not None:
             progress(done, None)
-    return indices, frame_ids
+    indexed = {topic: index_by_stamp(path, topic, stamps[topic], arrivals[topic]) for topic in stamps}
+    notes = [note for _, note in indexed.values() if note is not None]
+    return {topic: indices for topic, (indices, _) in indexed.items()}, frame_ids, notes
 
 
 def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
