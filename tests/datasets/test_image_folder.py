@@ -48,7 +48,20 @@ def test_images_of_two_folders_are_paired_in_order_of_their_numbers(root: Path) 
 
 def test_images_with_equal_names_are_paired_if_one_is_missing(root: Path) -> None:
     fill(root, [f"color/{i}.png" for i in (7, 8, 9)], [f"depth_png/{i}.png" for i in (9, 7)])
-    assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 1), (2, 0)])
+    assert_frames(load_sequence(str(root), options=FPS), [0, 0.2], [(0, 1), (2, 0)])
+
+
+def test_time_passes_at_the_frame_rate_also_where_depth_is_missing(root: Path) -> None:
+    fill(root, [f"rgb/{i:04d}.png" for i in range(20)], [f"depth/{i:04d}.png" for i in range(20) if i not in (5, 6)])
+    numbers = [i for i in range(20) if i not in (5, 6)]
+    assert_frames(
+        load_sequence(str(root), options=FPS), [i / 10 for i in numbers], [(n, i) for i, n in enumerate(numbers)]
+    )
+
+
+def test_frame_rate_is_that_of_colour_if_depth_has_half_of_it(root: Path) -> None:
+    fill(root, [f"rgb/{i:04d}.png" for i in range(20)], [f"depth/{i:04d}.png" for i in range(0, 20, 2)])
+    assert_frames(load_sequence(str(root), options=FPS), [i / 5 for i in range(10)], [(2 * i, i) for i in range(10)])
 
 
 def test_images_with_timestamps_as_names_are_paired_by_time(root: Path) -> None:
@@ -63,6 +76,7 @@ def test_timestamps_with_few_decimals_are_sorted_by_value(root: Path) -> None:
     fill(root, [f"rgb/{t}.png" for t in times], [f"depth/{t + 0.001:.3f}.png" for t in times])
     order = sorted(range(len(times)), key=lambda i: times[i])
     assert_frames(load_sequence(str(root)), sorted(times), [(i, i) for i in order])
+    assert_frames(load_sequence(str(root), options=FPS), [i / 10 for i in range(7)], [(i, i) for i in order])
 
 
 def test_colour_and_depth_in_one_folder_are_paired_by_name(root: Path) -> None:
@@ -94,7 +108,8 @@ def test_equal_names_are_preferred_to_names_with_other_zeros(root: Path) -> None
 
 def test_few_images_without_a_partner_are_left_out(root: Path) -> None:
     fill(root, [f"rgb/{i}.png" for i in range(11)], [f"depth/{i}.png" for i in range(1, 11)] + ["depth/99.png"])
-    assert_frames(load_sequence(str(root), options=FPS), [i / 10 for i in range(10)], [(i + 1, i) for i in range(10)])
+    stamps = [(i + 1) / 10 for i in range(10)]
+    assert_frames(load_sequence(str(root), options=FPS), stamps, [(i + 1, i) for i in range(10)])
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,8 @@ class ImageFolder(PairedImages):
     Args:
         folder: Folder of the sequence.
         camera: Camera chosen by the user; None for the ``camera.yaml`` or ``K.txt`` in the folder.
-        fps: Frame rate, Hz; None to read the timestamps from the file names.
+        fps: Frame rate of the colour images, Hz, including those without a partner; None to read the timestamps from
+            the file names.
 
     Raises:
         InputError: If there are no pairs, too few of the images have equal names, or there are no timestamps or no
@@ -46,7 +47,7 @@ class ImageFolder(PairedImages):
     def __init__(self, folder: Path, camera: CameraChoice = None, *, fps: float | None = None) -> None:
         colour, depth = _find_images(folder)
         files = _pair(folder, colour, depth)
-        stamps = _stamps(folder, [path for path, _ in files], fps)
+        stamps = _stamps(folder, colour, [path for path, _ in files], fps)
         pairs = [
             ImagePair(stamp, *(str(path.relative_to(folder)) for path in pair))
             for stamp, pair in sorted(dict(zip(stamps, files, strict=True)).items())
@@ -119,13 +120,16 @@ def _by_stamp(paths: list[Path]) -> dict[float, Path]:
     return dict(sorted((stamp, path) for path in paths if (stamp := stamp_in_name(path)) is not None))
 
 
-def _stamps(folder: Path, colour: list[Path], fps: float | None) -> list[float]:
-    """Timestamps of the colour images, seconds, from the frame rate or the file names."""
+def _stamps(folder: Path, colour: list[Path], paired: list[Path], fps: float | None) -> list[float]:
+    """Timestamps of the paired colour images, seconds, from their positions among all of them or from their names."""
     if fps is not None:
-        return [index / fps for index in range(len(colour))]
-    stamps = [stamp for path in colour if (stamp := stamp_in_name(path)) is not None]
-    if len(stamps) != len(colour):
+        by_stamp = _by_stamp(colour)
+        in_order = by_stamp.values() if len(by_stamp) == len(colour) else colour
+        position = {path: index for index, path in enumerate(in_order)}
+        return [position[path] / fps for path in paired]
+    stamps = [stamp for path in paired if (stamp := stamp_in_name(path)) is not None]
+    if len(stamps) != len(paired):
         raise InputError(
-            f"{folder}: file names such as {colour[0].name} are not timestamps; pass the frame rate with --fps"
+            f"{folder}: file names such as {paired[0].name} are not timestamps; pass the frame rate with --fps"
         )
     return stamps
