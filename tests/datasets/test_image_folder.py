@@ -177,6 +177,17 @@ def test_invalid_image_folder_is_rejected(
     assert str(root) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_names_in_nanoseconds_since_the_start_of_the_computer_are_rejected(root: Path) -> None:
+    """They have as many digits as milliseconds since 1970."""
+    names = [f"{5_000_000_000_000 + i * 33_333_333}.png" for i in range(3)]
+    fill(root, [f"rgb/{name}" for name in names], [f"depth/{name}" for name in names])
+    with pytest.raises(
+        InputError, match=r"mine: the images are 33333\.3 s apart .*; convert the timestamps to seconds"
+    ):
+        load_sequence(str(root))
+    assert load_sequence(str(root), options=FPS).stamps.tolist() == pytest.approx([0, 0.1, 0.2])
+
+
 def test_image_folder_without_camera_and_file_instead_of_folder_are_rejected(root: Path) -> None:
     fill(root, ["rgb/1.png"], ["depth/1.png"])
     with pytest.raises(InputError, match="is not a sequence of a supported format"):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import list_images, stamp_in_name
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair, check_stamp_unit
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import associate
@@ -40,8 +40,8 @@ class ImageFolder(PairedImages):
             the file names.
 
     Raises:
-        InputError: If there are no pairs, too few of the images have equal names, or there are no timestamps or no
-            camera.
+        InputError: If there are no pairs, too few of the images have equal names, there are no timestamps or no camera,
+            or the timestamps are not in a known unit.
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None, *, fps: float | None = None) -> None:
@@ -52,6 +52,8 @@ class ImageFolder(PairedImages):
             ImagePair(stamp, *(str(path.relative_to(folder)) for path in pair))
             for stamp, pair in sorted(dict(zip(stamps, files, strict=True)).items())
         ]
+        if fps is None:
+            check_stamp_unit(pairs, folder)
         super().__init__(folder, pairs, camera)
 
 

@@ -156,8 +156,8 @@ def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
     gap = median(later.stamp - earlier.stamp for earlier, later in pairwise(pairs)) if len(pairs) > 1 else 0.0
     if gap > _MAX_GAP:
         raise InputError(
-            f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps in the"
-            " lists to seconds (they are probably in milliseconds or nanoseconds)"
+            f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps to"
+            " seconds (they are probably in milliseconds or nanoseconds)"
         )
 
 

@@ -141,16 +141,16 @@ CASES = [
         "milliseconds since the first frame",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e3:.0f}"),
         Fails(
-            "{seq}: the images are 100 s apart according to their timestamps; convert the timestamps in the"
-            " lists to seconds (they are probably in milliseconds or nanoseconds)"
+            "{seq}: the images are 100 s apart according to their timestamps; convert the timestamps to"
+            " seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
     Case(
         "nanoseconds since the first frame",
         stamps_as(lambda s: f"{(s - 1305031102) * 1e9:.0f}"),
         Fails(
-            "{seq}: the images are 9.99999e+07 s apart according to their timestamps; convert the timestamps in"
-            " the lists to seconds (they are probably in milliseconds or nanoseconds)"
+            "{seq}: the images are 9.99999e+07 s apart according to their timestamps; convert the timestamps to"
+            " seconds (they are probably in milliseconds or nanoseconds)"
         ),
     ),
     Case("negative timestamps", stamps_as(lambda s: f"{s - 1305031102.35:.6f}"), Succeeds()),
