@@ -12,7 +12,7 @@ from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError, 
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
 from v3d_torch.runs.log import log_to
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import clear_earlier_results
 from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_segmenter
@@ -60,13 +60,14 @@ def _make_request(job: Job) -> RunRequest:
 
 
 def _matching_checkpoint(job: Job) -> Checkpoint | None:
-    """Return the checkpoint of the same run; None if there is no readable checkpoint, so that the run restarts."""
+    """Return the checkpoint of the same run, whose sequence may have been moved; None if there is none to read."""
     try:
         checkpoint = read_checkpoint(job.folder)
     except InputError:
         return None
     request, wanted = checkpoint.request, _make_request(job).absolute()
-    same = replace(request, config=single_threaded(request.config), skip_broken=job.skip_broken) == replace(
+    changed = {name: getattr(wanted, name) for name in CHANGEABLE}
+    same = replace(request, config=single_threaded(request.config), **changed) == replace(
         wanted, config=single_threaded(wanted.config)
     )
     return checkpoint if same else None

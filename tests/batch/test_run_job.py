@@ -1,0 +1,37 @@
+"""Execution of one job: continuation from its checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from helpers.batches import plan_seeds, repeat_sequence
+
+from v3d_torch.batch.run_job import run_job
+from v3d_torch.runs.checkpoint import CHECKPOINT
+
+
+def stop_after(frames: int) -> tuple[list[int], Callable[[int], None]]:
+    """Return the progress of a job, and the callback that fills it and interrupts the job after some frames."""
+    progress: list[int] = []
+
+    def report(done: int) -> None:
+        progress.append(done)
+        if done >= frames:
+            raise KeyboardInterrupt
+
+    return progress, report
+
+
+def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    (first,) = plan_seeds(repeat_sequence(moment, tmp_path / "old" / "long", frames=8), tmp_path / "out", seeds=1)
+    progress, report = stop_after(4)
+    assert run_job(first, report) is not None
+    assert progress == [1, 2, 3, 4] and (first.folder / CHECKPOINT).is_file()
+    (tmp_path / "old").rename(tmp_path / "new")
+    (moved,) = plan_seeds(tmp_path / "new" / "long", tmp_path / "out", seeds=1)
+    assert moved.folder == first.folder and moved.source != first.source
+    progress = []
+    assert run_job(moved, progress.append) is None
+    assert progress == [5, 6, 7, 8]
