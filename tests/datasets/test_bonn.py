@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.bonn import CAMERA, BonnSequence
+from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.geometry.camera import PinholeCamera
 
 POSES = "10 1 2 3 0 0 0 1\n11 1.5 2 3 0 0 0.6 0.8\n"
@@ -62,12 +63,26 @@ def test_convention_ground_truth_is_of_the_camera(folder: Path) -> None:
         assert np.linalg.norm(T_wc[:3, 3] - (np.linalg.inv(T_ros) @ T)[:3, 3]) == pytest.approx(0.0186, abs=2e-4)
 
 
-def test_bonn_folder_with_camera_file_keeps_camera_poses(folder: Path) -> None:
+def test_bonn_folder_with_camera_file_has_its_camera_and_converted_poses(folder: Path) -> None:
+    converted = load_sequence(str(folder)).groundtruth
     (folder / "camera.yaml").write_text("fx: 1\nfy: 2\ncx: 3\ncy: 4\nwidth: 640\nheight: 480\ndepth_scale: 1000\n")
     sequence = load_sequence(str(folder))
+    assert isinstance(sequence, BonnSequence)
     assert sequence.camera == PinholeCamera(1, 2, 3, 4, depth_scale=1000)
-    assert sequence.groundtruth is not None
-    assert sequence.groundtruth.T_wc[:, :3, 3].tolist() == [[1, 2, 3], [1.5, 2, 3]]
+    assert sequence.groundtruth is not None and converted is not None
+    assert torch.equal(sequence.groundtruth.T_wc, converted.T_wc)
+
+
+def test_recorded_bonn_sequence_is_not_converted_again(folder: Path, tmp_path: Path) -> None:
+    original = load_sequence(str(folder))
+    copy = tmp_path / "copies" / folder.name
+    with TUMWriter(copy, original.camera, original.groundtruth) as writer:
+        for frame in original:
+            writer.add(frame)
+    recorded = load_sequence(str(copy))
+    assert not isinstance(recorded, BonnSequence) and recorded.camera == original.camera
+    assert recorded.groundtruth is not None and original.groundtruth is not None
+    torch.testing.assert_close(recorded.groundtruth.T_wc, original.groundtruth.T_wc, rtol=0, atol=1e-8)
 
 
 def test_bonn_sequence_without_ground_truth_is_opened(folder: Path) -> None:

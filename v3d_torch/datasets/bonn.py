@@ -9,6 +9,7 @@ import torch
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.locate import is_tum
 from v3d_torch.datasets.tum import TUMSequence
+from v3d_torch.datasets.tum_writer import is_recorded_truth
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.types import Trajectory
@@ -66,9 +67,9 @@ class BonnSequence(TUMSequence):
 def is_bonn(path: Path) -> bool:
     """Check whether a folder is an original sequence of the dataset, by its name and content.
 
-    A folder with ``camera.yaml`` was written by ``v3d-torch record``: its ground truth is already converted.
+    The ground truth that ``v3d-torch record`` writes is already converted.
     """
-    return "rgbd_bonn" in path.resolve().name.lower() and is_tum(path) and not (path / "camera.yaml").is_file()
+    return "rgbd_bonn" in path.resolve().name.lower() and is_tum(path) and not is_recorded_truth(path)
 
 
 def camera_poses(markers: Trajectory) -> Trajectory:

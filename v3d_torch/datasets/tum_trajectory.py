@@ -62,7 +62,7 @@ def read_trajectory(path: StrPath) -> Trajectory:
     return Trajectory(torch.from_numpy(stamps), T_wc)
 
 
-def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
+def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | None = None) -> None:
     """Write a trajectory in TUM format.
 
     Timestamps have 6 decimals, the other columns 9. Quaternions have qw >= 0. The file is replaced atomically, so that
@@ -70,7 +70,8 @@ def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
 
     Args:
         path: Path of the file; missing folders are created.
-        trajectory: Camera-to-world poses; an empty trajectory creates an empty file.
+        trajectory: Camera-to-world poses; an empty trajectory creates a file without poses.
+        comment: Comment for the first line; None for no comment.
 
     Raises:
         InputError: If ``trajectory`` is not a `Trajectory`, or one of its poses is not a rigid transform.
@@ -85,11 +86,11 @@ def write_trajectory(path: StrPath, trajectory: Trajectory) -> None:
         rigid = np.isfinite(T_wc).all(axis=(1, 2)) & (np.linalg.det(T_wc[:, :3, :3]) > 0)
     if not rigid.all():
         raise InputError(f"{path}: pose {rigid.argmin()} is not a valid rigid transform; repair or remove it")
-    lines = []
+    lines = [] if comment is None else [f"# {comment}\n"]
     if len(trajectory):
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
         poses = np.concatenate([T_wc[:, :3, 3], quaternions], axis=1).round(9) + 0.0  # + 0.0: no "-0.000000000"
-        lines = [
+        lines += [
             f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in pose) + "\n"
             for stamp, pose in zip(trajectory.stamps.tolist(), poses.tolist(), strict=True)
         ]

@@ -19,6 +19,9 @@ from v3d_torch.types import RGBDFrame, Trajectory
 _DEPTH_SCALE = 5000.0
 """Depth scale of the TUM benchmark, units per metre."""
 
+_GROUND_TRUTH, _COMMENT = "groundtruth.txt", "poses of the camera, written by v3d-torch"
+"""Name and first line of the file of measured poses."""
+
 
 class TUMWriter:
     """Writer of RGB-D frames to a folder in TUM layout, used as a context manager.
@@ -44,7 +47,7 @@ class TUMWriter:
         written = replace(camera, depth_scale=self._depth_scale, inverse_depth_offset=0.0)
         write_text(folder / "camera.yaml", camera_text(written))
         if groundtruth is not None:
-            write_trajectory(folder / "groundtruth.txt", groundtruth)
+            write_trajectory(folder / _GROUND_TRUTH, groundtruth, comment=_COMMENT)
 
     def __enter__(self) -> TUMWriter:
         return self
@@ -77,3 +80,12 @@ class TUMWriter:
         write_png(self.folder / "rgb" / f"{stamps[0]}.png", frame.image.permute(1, 2, 0).numpy())
         write_png(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))
         self._written.append(stamps)
+
+
+def is_recorded_truth(folder: Path) -> bool:
+    """Check whether the ground truth of a folder in TUM layout was written by `TUMWriter`."""
+    try:
+        with (folder / _GROUND_TRUTH).open("rb") as file:
+            return file.readline(len(_COMMENT) + 4).decode(errors="replace").strip() == f"# {_COMMENT}"
+    except OSError:  # there is none, or it cannot be read, which is reported when the folder is opened
+        return False
