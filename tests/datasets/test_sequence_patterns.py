@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from errno import EACCES
 from pathlib import Path
 
 import pytest
+from helpers.tiny_images import colour_of, save
 
+from v3d_torch.datasets import open_source
 from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, short_name
 from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError
@@ -35,6 +38,27 @@ def test_pattern_matches_only_sequences_in_data_root(root: Path) -> None:
     assert matching_sequences(["walk_*"], root) == ["walk_a", "walk_b"]
     assert matching_sequences(["*"], root) == ["fr1_xyz", "rgbd_dataset_freiburg1_rpy", "sit", "walk_a", "walk_b"]
     assert matching_sequences(["walk_[!a]", "s?t"], root) == ["walk_b", "sit"]
+
+
+def test_folders_without_depth_match_no_pattern(root: Path) -> None:
+    for name in ("images", "img"):
+        save(root / "website" / name / "1.png", colour_of(0))
+    assert matching_sequences([str(root / "w*")]) == [str(root / "walk_a"), str(root / "walk_b")]
+
+
+def test_folder_that_cannot_be_read_matches_no_pattern(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (root / "lost+found").mkdir()
+    is_file = Path.is_file
+
+    def refuse(path: Path) -> bool:
+        if "lost+found" in path.parts:
+            raise PermissionError(EACCES, "Permission denied", str(path))
+        return is_file(path)
+
+    monkeypatch.setattr(Path, "is_file", refuse)
+    assert matching_sequences([str(root / "[ls]*")]) == [str(root / "sit")]
+    with pytest.raises(InputError, match=r"lost\+found.*: cannot be read \(Permission denied\)"):
+        open_source(root / "lost+found")
 
 
 def test_pattern_matches_paths(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,25 +58,35 @@ class ImageFolder(PairedImages):
 
 
 def is_image_folder(path: Path) -> bool:
-    """Check whether a folder contains colour and depth images."""
-    return path.is_dir() and all(_find_images(path))
+    """Check whether a folder contains colour and depth images, perhaps in more subfolders than can be opened."""
+    return path.is_dir() and (all(_image_folders(path)) or all(_images_side_by_side(path)))
 
 
 def _find_images(folder: Path) -> tuple[list[Path], list[Path]]:
     """Find the colour and depth images, by the names of their subfolders or by their own names."""
-    folders = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and list_images(entry)]
-    depth = [entry for entry in folders if _DEPTH.search(entry.name)]
-    colour = [entry for entry in folders if entry not in depth and _COLOUR.search(entry.name)]
+    colour, depth = _image_folders(folder)
+    if not colour or not depth:
+        return _images_side_by_side(folder)
     if len(colour) > 1 or len(depth) > 1:
         names = ", ".join(entry.name for entry in colour + depth)
         raise InputError(
             f"{folder}: has too many image folders ({names}); keep one folder of colour and one of depth images"
         )
-    if colour and depth:
-        return list_images(colour[0]), list_images(depth[0])
+    return list_images(colour[0]), list_images(depth[0])
+
+
+def _image_folders(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Subfolders with colour and with depth images, by their names."""
+    folders = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and list_images(entry)]
+    depth = [entry for entry in folders if _DEPTH.search(entry.name)]
+    return [entry for entry in folders if entry not in depth and _COLOUR.search(entry.name)], depth
+
+
+def _images_side_by_side(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Colour and depth images in the folder itself, by their names."""
     images = list_images(folder)
-    depths = [path for path in images if _DEPTH.search(path.stem)]
-    return [path for path in images if path not in depths and _COLOUR.search(path.stem)], depths
+    depth = [path for path in images if _DEPTH.search(path.stem)]
+    return [path for path in images if path not in depth and _COLOUR.search(path.stem)], depth
 
 
 def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Path, Path]]:

@@ -106,8 +106,14 @@ _UNKNOWN = (
 
 
 def is_source(path: Path) -> bool:
-    """Check whether a path is a source of any supported kind. Opening the source checks its content."""
-    return any(source.matches(path) for source in SOURCES)
+    """Check whether a path is a source of any supported kind. Opening the source checks its content.
+
+    A path that cannot be read is none: many file systems have such a folder, for example ``lost+found``.
+    """
+    try:
+        return any(source.matches(path) for source in SOURCES)
+    except OSError:
+        return False
 
 
 def open_path(path: Path, camera: CameraChoice, options: SourceOptions, progress: Progress | None) -> RGBDStream:
