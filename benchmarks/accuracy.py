@@ -29,9 +29,10 @@ from systems.process import SystemRunError, failure, measure
 from tables import unique
 
 from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.sequence_names import find_paper_sequence
 from v3d_torch.errors import InputError, V3DError
 from v3d_torch.evaluation import evaluate
-from v3d_torch.evaluation.paper_tables import find_paper_sequence, load_paper_scores
+from v3d_torch.evaluation.paper_tables import load_paper_scores
 from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 from v3d_torch.types import TrackingStatus
 

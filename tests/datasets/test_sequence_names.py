@@ -11,6 +11,7 @@ from v3d_torch.datasets.sequence_names import (
     SEQUENCES,
     canonical_name,
     download_url,
+    find_paper_sequence,
     folder_label,
     short_name,
 )
@@ -78,6 +79,26 @@ def test_paper_sequences_have_the_short_names_of_its_tables() -> None:
     assert short == [f"fr3/{p}/{m}" for p in "sw" for m in ("xyz", "half", "static", "rpy")]
     assert short_name("walkers_desk") == "walkers_desk"
     assert len(set(SEQUENCES)) == len(SEQUENCES) == 80
+
+
+@pytest.mark.parametrize(
+    ("name", "sequence"),
+    [
+        ("fr3/w/xyz", "fr3/w/xyz"),
+        ("walking_half", "fr3/w/half"),
+        ("fr3_sit_static.txt", "fr3/s/static"),
+        ("results/fr3_w_rpy/latest/trajectory.txt", "fr3/w/rpy"),
+        ("rgbd_dataset_freiburg3_sitting_rpy_TRANSLATION_ONLY.txt", "fr3/s/rpy"),
+        ("data/rgbd_dataset_freiburg3_walking_halfsphere/groundtruth.txt", "fr3/w/half"),
+        ("rgbd_dataset_freiburg3_walking_xyz_validation/groundtruth.txt", None),
+        ("fr3_w_xyz/fr3_s_xyz.txt", None),
+        ("fr3_walking_xyz_first300", "fr3/w/xyz"),
+        ("fr1_rpy", None),
+        ("demo", None),
+    ],
+)
+def test_paper_sequence_is_found_in_names_and_paths(name: str, sequence: str | None) -> None:
+    assert find_paper_sequence(name) == sequence
 
 
 def test_download_url_is_that_of_the_benchmark() -> None:

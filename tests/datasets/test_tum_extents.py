@@ -13,6 +13,8 @@ from v3d_torch.datasets import PAPER_SEQUENCES, short_name
 from v3d_torch.datasets.lists import read_image_list
 from v3d_torch.datasets.tum_extents import EXTENTS, describe_difference, describe_estimate_difference
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.summary import format_markdown
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
 
@@ -93,6 +95,16 @@ def test_unknown_name_has_no_difference() -> None:
 )
 def test_part_of_a_sequence_is_recognised(selected: slice, difference: str) -> None:
     assert describe_difference(replace(whole(), stamps=whole().stamps[selected])) == difference
+
+
+def test_part_is_marked_in_the_row_with_the_results_of_the_paper() -> None:
+    """The table compares a sequence with the paper if its name contains one of the paper."""
+    name = "fr3_walking_xyz_first300"
+    difference = describe_difference(replace(whole(), name=name, stamps=whole().stamps[:300]))
+    text = format_markdown([Outcome(name, "full", 0, {"ate": {"rmse": 0.001}, "difference": difference})])
+    (row,) = (line for line in text.splitlines() if name in line)
+    assert row.startswith(f"| {name} (part: 300 of 827 frames) | 0.0010 |") and "**" not in row
+    assert "V3D-SLAM (paper)" in text
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.evaluation import Evaluation, evaluate
-from v3d_torch.evaluation.paper_tables import find_paper_sequence, load_paper_scores, make_paper_table
+from v3d_torch.evaluation.paper_tables import load_paper_scores, make_paper_table
 
 SEQUENCES = {
     f"fr3/{people[0]}/{motion[:4] if motion == 'halfsphere' else motion}": f"freiburg3_{people}_{motion}"
@@ -92,21 +92,5 @@ def test_paper_table_omits_rpe_over_other_delta() -> None:
     assert [list(column.cells)[-1] for column in table.columns[3:]] == ["-"] * 4
 
 
-@pytest.mark.parametrize(
-    ("name", "sequence"),
-    [
-        ("fr3/w/xyz", "fr3/w/xyz"),
-        ("walking_half", "fr3/w/half"),
-        ("fr3_sit_static.txt", "fr3/s/static"),
-        ("results/fr3_w_rpy/latest/trajectory.txt", "fr3/w/rpy"),
-        ("rgbd_dataset_freiburg3_sitting_rpy_TRANSLATION_ONLY.txt", "fr3/s/rpy"),
-        ("data/rgbd_dataset_freiburg3_walking_halfsphere/groundtruth.txt", "fr3/w/half"),
-        ("rgbd_dataset_freiburg3_walking_xyz_validation/groundtruth.txt", None),
-        ("fr3_w_xyz/fr3_s_xyz.txt", None),
-        ("fr1_rpy", None),
-        ("demo", None),
-    ],
-)
-def test_paper_sequence_is_found_in_names_and_paths(name: str, sequence: str | None) -> None:
-    assert find_paper_sequence(name) == sequence
+def test_paper_scores_have_all_sequences_of_the_paper() -> None:
     assert set(load_paper_scores()["ate"]) == set(SEQUENCES)

@@ -43,11 +43,12 @@ def main(
     from rich.console import Console
 
     with quick_imports():
+        from v3d_torch.datasets.sequence_names import find_paper_sequence
         from v3d_torch.datasets.tum_extents import describe_estimate_difference
         from v3d_torch.datasets.tum_trajectory import read_trajectory
         from v3d_torch.errors import InputError, V3DError
         from v3d_torch.evaluation import evaluate
-        from v3d_torch.evaluation.paper_tables import find_paper_sequence, make_paper_table
+        from v3d_torch.evaluation.paper_tables import make_paper_table
 
     try:
         truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)

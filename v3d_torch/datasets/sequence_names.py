@@ -132,6 +132,22 @@ def folder_label(folder: str) -> str:
     return short_name(folder) if re.search(r"fr(?:eiburg)?[^a-z0-9]*[123]", folder.lower()) else folder
 
 
+def find_paper_sequence(name: str) -> str | None:
+    """Find the sequence of the paper that a text or a path names.
+
+    Args:
+        name: Name or path, such as ``fr3/w/xyz``, ``results/fr3_w_xyz/latest/trajectory.txt`` or
+            ``freiburg3_walking_xyz``.
+
+    Returns:
+        Short name, such as ``fr3/w/xyz``; None if the text names no sequence of the paper, or several.
+    """
+    pattern = r"(?:freiburg|fr)_?3[/_-][a-z]+[/_-](?:xyz|half(?:sphere)?|static|rpy)(?![a-z]|_?validation)"
+    candidates = {canonical_name(text) for text in [name, *re.findall(pattern, name.lower())]}
+    found = [sequence for sequence in PAPER_SEQUENCES if sequence in candidates]
+    return short_name(found[0]) if len(found) == 1 else None
+
+
 def download_url(full_name: str) -> str:
     """URL of a sequence's archive on the benchmark's server."""
     camera = full_name.removeprefix(_PREFIX).split("_")[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
-from v3d_torch.datasets.sequence_names import short_name
+from v3d_torch.datasets.sequence_names import find_paper_sequence, short_name
 from v3d_torch.types import Trajectory
 
 _MAX_MISSING_FRACTION = 0.01
@@ -77,15 +77,15 @@ fr3/s/rpy are not included."""
 
 
 def describe_difference(sequence: RGBDStream) -> str | None:
-    """Describe how a sequence differs from the sequence of the TUM benchmark that has its name.
+    """Describe how a sequence differs from the sequence of the TUM benchmark that its name contains.
 
     Args:
-        sequence: Sequence, compared with the sequence of the benchmark of the same name.
+        sequence: Sequence, such as ``fr3_walking_xyz_first300``, which is compared with ``fr3/w/xyz``.
 
     Returns:
         Text such as "part: 60 of 827 frames"; None if the sequences agree, or if the extent is not known.
     """
-    extent = EXTENTS.get(short_name(sequence.name))
+    extent = _find_extent(sequence.name)
     if extent is None or not isinstance(sequence, RGBDSequence) or len(sequence) == 0:
         return None
     stamps = sequence.stamps
@@ -106,12 +106,17 @@ def describe_estimate_difference(name: str, estimate: Trajectory, groundtruth: T
     Returns:
         Text as that of `describe_difference`; None if the sequences agree, or if the extent is not known.
     """
-    extent = EXTENTS.get(short_name(name))
+    extent = _find_extent(name)
     if extent is None or len(estimate) == 0:
         return None
     number = min(len(estimate), extent.frames.number)
     poses = Span(number, float(estimate.stamps[0]), float(estimate.stamps[-1]))
     return _compare(poses, extent.frames, "frames") or _compare_truth(groundtruth, extent)
+
+
+def _find_extent(name: str) -> Extent | None:
+    """Find the extent of a sequence by the rule of the tables with the paper's results."""
+    return EXTENTS.get(find_paper_sequence(name) or short_name(name))
 
 
 def _compare_truth(truth: Trajectory, extent: Extent) -> str | None:

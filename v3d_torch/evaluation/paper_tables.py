@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
@@ -11,7 +10,7 @@ from typing import NamedTuple
 import yaml
 from rich.table import Table
 
-from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, canonical_name, short_name
+from v3d_torch.datasets.sequence_names import find_paper_sequence
 from v3d_torch.evaluation.evaluation import Evaluation
 from v3d_torch.evaluation.outcome import label_sequence
 
@@ -43,22 +42,6 @@ def load_paper_scores() -> Mapping[str, Mapping[str, Mapping[str, Score]]]:
         }
         for metric, table in tables.items()
     }
-
-
-def find_paper_sequence(name: str) -> str | None:
-    """Find the sequence of the paper that a text or a path names.
-
-    Args:
-        name: Name or path, such as ``fr3/w/xyz``, ``results/fr3_w_xyz/latest/trajectory.txt`` or
-            ``freiburg3_walking_xyz``.
-
-    Returns:
-        Short name, such as ``fr3/w/xyz``; None if the text names no sequence of the paper, or several.
-    """
-    pattern = r"(?:freiburg|fr)_?3[/_-][a-z]+[/_-](?:xyz|half(?:sphere)?|static|rpy)(?![a-z]|_?validation)"
-    candidates = {canonical_name(text) for text in [name, *re.findall(pattern, name.lower())]}
-    found = [sequence for sequence in PAPER_SEQUENCES if sequence in candidates]
-    return short_name(found[0]) if len(found) == 1 else None
 
 
 def make_paper_table(sequence: str, evaluation: Evaluation, difference: str | None = None) -> Table | None:

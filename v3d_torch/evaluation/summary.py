@@ -10,9 +10,10 @@ from statistics import median
 
 from rich.table import Table
 
+from v3d_torch.datasets.sequence_names import find_paper_sequence
 from v3d_torch.evaluation.comparison import compare_configurations
 from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
-from v3d_torch.evaluation.paper_tables import HEADINGS, find_paper_sequence, load_paper_scores
+from v3d_torch.evaluation.paper_tables import HEADINGS, load_paper_scores
 from v3d_torch.evaluation.tables import (
     Cell,
     ErrorTable,
