@@ -423,16 +423,21 @@ class ObjectStage:
     def __call__(
         self,
         stamp: float,
-        instances: Instances,
+        instances: Instances | None,
         depth: Tensor,
         T_wc: Tensor,
         cloud_depth: Tensor | None = None,
         guess: Guess | None = None,
     ) -> FrameObjects:
-        """Process a frame. The clouds use ``cloud_depth`` if it is given, everything else uses ``depth``."""
+        """Process a frame; None for its instances if it is not segmented.
+
+        The clouds use ``cloud_depth`` if it is given, everything else uses ``depth``.
+        """
         guess = guess or Guess(T_wc)
         view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), has_motion=guess.is_measured)
         newly_occupied = self._free_space_check(view, pose_known=guess.is_measured and not self._is_lost)
+        if instances is None:
+            instances = self._classify.propagate_instances(view)
         min_area = self._config.free_space.min_unlabelled_area
         unlabelled = unlabelled_instances(newly_occupied, instances, depth, self._camera, min_area)
         self.instances = instances.concatenate(unlabelled)

@@ -468,6 +468,17 @@ def test_objects_without_centroid_are_matched_by_masks() -> None:
     assert not tracks[0].velocity.any()
 
 
+def test_missed_object_without_centroid_keeps_id_and_mask() -> None:
+    track_boards = BoardTracker()
+    depth, instances = render([Board(0.0)])
+    depth[:, instances.masks[0]] = 7.0  # beyond the maximum depth of clouds
+    for frame in range(4):
+        found = Instances.empty(CAMERA.height, CAMERA.width) if frame in (1, 2) else instances
+        (track,) = track_boards.track(depth, found, frame / 30)
+        assert (track.id, track.missed) == (1, frame in (1, 2))
+        assert torch.equal(track.mask, instances.masks[0])
+
+
 def test_missing_centroid_in_one_frame_keeps_id_and_velocity() -> None:
     track_boards = BoardTracker()
     for frame in range(12):

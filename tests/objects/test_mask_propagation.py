@@ -5,11 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 from helpers.boards import CAMERA, CHAIR, CLOUDS, HERE, PERSON, Board, BoardTracker, render
+from helpers.scenes import ObjectStage
 from torch import Tensor
 
 from v3d_torch import V3DSLAM, RGBDFrame, load_config, load_sequence
-from v3d_torch.config import Config
+from v3d_torch.config import Config, ObjectsConfig
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.mask_propagation import propagate_instances
 from v3d_torch.segmentation import NoSegmentation
@@ -35,7 +37,7 @@ def propagate(track_boards: BoardTracker, boards: list[Board], T_wc: Tensor = HE
     """Return the propagated and the true instances of the next frame."""
     depth, truth = render(boards, T_wc)
     view = DepthView((track_boards.frame + 1) / track_boards.rate, depth, invert(T_wc))
-    return propagate_instances(track_boards.tracker.tracks, view, CAMERA, CLOUDS.voxel_size), truth
+    return propagate_instances(track_boards.tracker.tracks, view, CAMERA, CLOUDS), truth
 
 
 def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
@@ -72,6 +74,29 @@ def test_missed_and_unlabelled_objects_are_not_propagated() -> None:
     assert found.labels.tolist() == [PERSON]
     found, _ = propagate(walk(label=UNLABELLED), [Board(-0.36), STANDING])
     assert found.labels.tolist() == [PERSON]
+
+
+@pytest.mark.parametrize("z", [7.0, 0.0], ids=["too far", "no depth"])
+@pytest.mark.parametrize("segmented", [{0, 2, 4, 6}, {0, 1, 3, 6}], ids=["every second frame", "in some frames"])
+def test_person_without_centroid_stays_masked_in_frames_without_segmentation(z: float, segmented: set[int]) -> None:
+    stage = ObjectStage(ObjectsConfig(clouds=CLOUDS), CAMERA)
+    for frame in range(8):
+        depth, instances = render([Board(-0.4 + 0.02 * frame)])
+        depth[:, instances.masks[0]] = z
+        result = stage(frame / 30, instances if frame in segmented else None, depth, HERE)
+        assert [(obj.id, obj.missed, obj.motion_state) for obj in result.objects] == [(1, False, MotionState.UNKNOWN)]
+        assert not result.static_mask[instances.masks[0]].any()
+
+
+def test_person_without_centroid_stays_masked_in_a_frame_in_which_the_network_misses_it() -> None:
+    stage = ObjectStage(ObjectsConfig(clouds=CLOUDS), CAMERA)
+    for frame in range(4):
+        depth, instances = render([Board(-0.4 + 0.02 * frame)])
+        depth[:, instances.masks[0]] = 7.0
+        found = Instances.empty(CAMERA.height, CAMERA.width) if frame == 2 else instances
+        result = stage(frame / 30, found, depth, HERE)
+        assert [(obj.id, obj.missed) for obj in result.objects] == [(1, frame == 2)]
+        assert not result.static_mask[instances.masks[0]].any()
 
 
 def test_no_tracks_give_no_instances() -> None:

@@ -275,8 +275,11 @@ class InstanceTracker(torch.nn.Module):
             if stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:
                 lost.append(track)
                 continue
-            mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
-            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
+            if track.newest.has_centroid:
+                mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
+                track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
+            else:  # without points to project, the last masks are the best prediction
+                track.missed = True
             is_recent = stamp - track.newest.stamp <= _MAX_VISIBLE_TIME + STAMP_TOLERANCE
             track.visible = bool(predicted.visible[i]) and track.is_confirmed and is_recent
             missed.append(track)

@@ -3,7 +3,8 @@
 Segmentation of every second frame halves the largest cost of a frame. In the frame between, the track of an object
 predicts its points, and the depth image gives its outline: the pixels near the predicted points that have the depth of
 these points. Objects of propagated masks are measured like objects of network masks, so that centroids, votes and
-Chamfer distances come from the depth of the frame and not from a prediction.
+Chamfer distances come from the depth of the frame and not from a prediction. An object without a centroid, for example
+because it is too far for its depth, has no points to project: it keeps its last mask, where nothing else is measured.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
+from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.free_space_check import DepthView
-from v3d_torch.objects.silhouette import silhouettes
+from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Track
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
@@ -23,7 +26,9 @@ _DEPTH_TOLERANCE = 0.2
 """Tolerance of the depth around the predicted points, metres: arms and legs swing by this much between two frames."""
 
 
-def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, spacing: float) -> Instances:
+def propagate_instances(
+    tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, config: CloudConfig
+) -> Instances:
     """Compute the masks of detected objects that may move from the depth of the current frame.
 
     Unlabelled objects are left out, because they are detected in the depth of every frame. Furniture is left out,
@@ -33,25 +38,31 @@ def propagate_instances(tracks: Sequence[Track], view: DepthView, camera: Pinhol
         tracks: Tracks after the previous frame.
         view: Depth and pose of the frame.
         camera: Camera of the frame.
-        spacing: Spacing of the points of the tracks, metres.
+        config: Spacing and maximum depth of the points of the tracks.
 
     Returns:
         Instances with the classes of the tracks, score 0 and empty boxes.
     """
-    detected = [
-        track
-        for track in tracks
-        if track.may_move and not track.missed and track.newest.has_centroid and track.label != UNLABELLED
-    ]
+    detected = [track for track in tracks if track.may_move and not track.missed and track.label != UNLABELLED]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
-    projected = silhouettes([track.predict_cloud(view.stamp) @ R.T + t for track in detected], camera, spacing)
+    clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in detected]
+    projected = silhouettes(clouds, camera, config.voxel_size)
     masks = {
         track: mask
         for track, each in zip(detected, projected, strict=True)
         # An object without a pixel has left the view or is hidden: it is missed.
-        if (mask := each.mask(view.depth, 0, _DEPTH_TOLERANCE, include_missing=True)).numpy().any()
+        if (mask := _predict_mask(track, each, view.depth, config.max_depth)).numpy().any()
     }
     if not masks:
         return Instances.empty(*view.depth.shape[-2:])
     labels = torch.tensor([track.label for track in masks])
     return Instances(torch.stack([*masks.values()]), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
+
+
+def _predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float) -> Tensor:
+    """Return the pixels near the predicted points that have their depth; without a centroid see the module."""
+    if not track.newest.has_centroid:
+        # The depth of what is beside or in front of the object would become its centroid.
+        has_points = (depth[0] > 0) & (depth[0] <= max_depth)
+        return track.mask & ~has_points
+    return silhouette.mask(depth, 0, _DEPTH_TOLERANCE, include_missing=True)

@@ -79,7 +79,7 @@ class MaskRefiner:
         """Return the refined mask of one of the objects, bool, shape :math:`(H, W)`."""
         config, depth = self._config, self._view.depth
         if track not in self._silhouettes:  # too few points for a depth range of the object
-            return track.mask if track.missed else dilate(track.mask, config.depth_margin)
+            return dilate(track.mask, config.depth_margin)
         silhouette, median_depth = self._silhouettes[track]
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
         # NumPy combines masks faster here than torch.

@@ -137,7 +137,7 @@ class MotionClassifier:
         Args:
             view: Depth and pose of the frame.
         """
-        return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds.voxel_size)
+        return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state between frames: timestamp of the last frame and state of the tracker."""

@@ -70,7 +70,8 @@ class PredictedTracks:
     Attributes:
         tracks: T tracks.
         silhouettes: Projection of the newest cloud of each track at its predicted position.
-        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`.
+        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`; the last mask of a track without a centroid,
+            which has no points to predict.
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
             :math:`(T,)`.
     """
@@ -143,10 +144,14 @@ def predict_tracks(
     projected = silhouettes(clouds, camera, spacing)
     coarse_depth = depth[:, ::stride, ::stride].contiguous()
     masks = [each.mask(coarse_depth, 0, DEPTH_TOLERANCE, step=stride, include_missing=True) for each in projected]
+    packed = pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool))
+    for i, track in enumerate(tracks):
+        if not track.newest.has_centroid:
+            packed[i] = track.coarse_mask
     return PredictedTracks(
         tuple(tracks),
         projected,
-        pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
+        packed,
         torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
     )
 
