@@ -75,6 +75,15 @@ def test_ids_are_kept_under_flickering_class_and_label_is_the_most_frequent() ->
     assert tracks[0].labels == {PERSON: 4, DOG: 2, CHAIR: 1}
 
 
+@pytest.mark.parametrize("score", [0.9, 0.0])
+def test_most_frequent_class_of_masks_with_or_without_scores(score: float) -> None:
+    track_boards = BoardTracker()
+    for frame, label in enumerate((DOG, PERSON, PERSON)):
+        depth, instances = render([Board(0.0, label=label)])
+        (track,) = track_boards.track(depth, replace(instances, scores=torch.tensor([score])), frame / 30)
+    assert (track.label, track.labels) == (PERSON, {DOG: 1, PERSON: 2})
+
+
 @pytest.mark.parametrize("visible", [slice(40), slice(60)], ids=["upper part", "all but the feet"])
 def test_second_detection_of_an_object_starts_no_track(visible: slice) -> None:
     """The network finds a part of a person, and in some frames the whole person as well."""

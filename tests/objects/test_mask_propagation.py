@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.boards import CAMERA, CHAIR, CLOUDS, HERE, PERSON, Board, BoardTracker, render
+from helpers.boards import CAMERA, CHAIR, CLOUDS, DOG, HERE, PERSON, Board, BoardTracker, render
 from helpers.scenes import ObjectStage
 from torch import Tensor
 
@@ -97,6 +97,14 @@ def test_person_without_centroid_stays_masked_in_a_frame_in_which_the_network_mi
         result = stage(frame / 30, found, depth, HERE)
         assert [(obj.id, obj.missed) for obj in result.objects] == [(1, frame == 2)]
         assert not result.static_mask[instances.masks[0]].any()
+
+
+def test_wrong_first_class_is_corrected_with_frames_without_segmentation() -> None:
+    stage = ObjectStage(ObjectsConfig(clouds=CLOUDS), CAMERA)
+    for frame in range(6):
+        depth, instances = render([Board(-0.4 + 0.02 * frame, label=DOG if frame == 0 else PERSON)])
+        result = stage(frame / 30, instances if frame % 2 == 0 else None, depth, HERE)
+        assert [(obj.id, obj.label) for obj in result.objects] == [(1, PERSON if frame >= 4 else DOG)]
 
 
 def test_no_tracks_give_no_instances() -> None:

@@ -98,7 +98,7 @@ class Track:
             and the depth shows it at its predicted position.
         is_confirmed: True if scores or motion have shown that the object exists.
         detections: Detections of the last second, newest last, at least one.
-        labels: Number of detections of each class.
+        labels: Number of detections of each class. Once a detection had a score, those without one do not count.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
         total_score: Sum of the scores of all detections.
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
@@ -255,11 +255,14 @@ class Track:
     def update_label(self, label: int, score: float) -> None:
         """Update the class with the class of a detection.
 
+        A propagated mask has the class of the track and score 0: if it counted, a wrong first class would never change.
+
         Args:
             label: Class index.
             score: Score of the detection; 0 if it has none.
         """
-        self.labels[label] += 1
+        if score > 0 or self.total_score == 0:  # masks of a user can lack scores
+            self.labels[label] += 1
         self.total_score += score
         if self.total_score >= _MIN_CONFIRMED_SCORE:
             self.is_confirmed = True
