@@ -3,24 +3,41 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.occupancy_scenes import map_of
 from matplotlib import font_manager, get_data_path
+from matplotlib.figure import Figure
 
+from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.types import Trajectory
+from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.fonts import _characters, _families, drawable_text
-from v3d_torch.viz.trajectory_figure import save_trajectory_figure
+from v3d_torch.viz.objects_figure import draw_objects
+from v3d_torch.viz.occupancy_figure import draw_occupancy
+from v3d_torch.viz.trajectory_figure import draw_trajectory
 
 NAMES = ["部屋 室", "हिन्दी", "مطبخ", "a\tb\x07\x1b", "two\nlines", "😀\u200d\U000e0001", "$x^{"]
 
 
+POSES = Trajectory(torch.arange(3.0), torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+VOXELS = torch.tensor([[0, 0, 0], [1, 0, 0]])  # one occupied, one free
+UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+FIGURES: dict[str, Callable[[str], Figure]] = {
+    "trajectory": lambda title: draw_trajectory(None, POSES, title),
+    "objects": lambda title: draw_objects(ObjectTable(), POSES, torch.zeros(1, 3), UP, title),
+    "occupancy": lambda title: draw_occupancy(map_of(VOXELS[:1], VOXELS[1:]), POSES, UP, None, title),
+}
+
+
+@pytest.mark.parametrize("kind", FIGURES)
 @pytest.mark.parametrize("name", NAMES)
-def test_figure_with_any_name_is_drawn_without_warnings(name: str, tmp_path: Path) -> None:
-    poses = Trajectory(torch.arange(3.0), torch.eye(4, dtype=torch.float64).repeat(3, 1, 1))
+def test_figure_with_any_name_is_drawn_without_warnings(kind: str, name: str, tmp_path: Path) -> None:
     with warnings.catch_warnings(action="error"):
-        save_trajectory_figure(None, poses, tmp_path / "figure.png", name)
+        save_figure(FIGURES[kind](name), tmp_path / "figure.png")
 
 
 def test_text_of_the_default_font_is_unchanged() -> None:

@@ -2,15 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 
 from matplotlib import font_manager
+from matplotlib.text import Text
 
 _REPLACEMENT = "?"
 """Replacement for characters that no installed font has, instead of an empty box."""
 
 _PLACEHOLDERS = "Last Resort"
 """Beginning of the names of fonts that have a box for every character."""
+
+
+def draw_title(set_title: Callable[..., Text], title: str) -> None:
+    """Draw a title of the user, such as the name of a folder, which may contain dollar signs and letters of any script.
+
+    Args:
+        set_title: `Axes.set_title` or `Figure.suptitle`.
+        title: Title.
+    """
+    text, fonts = drawable_text(title)
+    set_title(text, parse_math=False, fontfamily=fonts)
 
 
 def drawable_text(text: str) -> tuple[str, list[str]]:

@@ -18,6 +18,7 @@ from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import Trajectory
+from v3d_torch.viz.fonts import draw_title
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
-    axes.set_title(title, parse_math=False)  # the name of a folder may contain dollar signs
+    draw_title(axes.set_title, title)
     _separate_names(figure, axes)
     return figure
 

@@ -16,6 +16,7 @@ from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.types import Trajectory
+from v3d_torch.viz.fonts import draw_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,7 +75,7 @@ def draw_occupancy(
         colour = STATE_COLOURS[state]
         panels[0].plot([], [], "s", color=colour, markeredgecolor="gray", label=state.name.lower())
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
-    figure.suptitle(title, parse_math=False)  # the name of a folder may contain dollar signs
+    draw_title(figure.suptitle, title)
     return figure
 
 

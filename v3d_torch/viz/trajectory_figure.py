@@ -18,7 +18,7 @@ from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import save_figure
-from v3d_torch.viz.fonts import drawable_text
+from v3d_torch.viz.fonts import draw_title
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -89,8 +89,7 @@ def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title:
     axes.plot([], [], "o", color="gray", label="start")
     _set_square_view(axes, torch.cat([positions[:, plane] for _, positions, _, _ in curves]))
     axes.set(xlabel=f"{'xyz'[horizontal]} [m]", ylabel=f"{'xyz'[vertical]} [m]")
-    text, fonts = drawable_text(title)
-    axes.set_title(text, parse_math=False, fontfamily=fonts)  # the name of a folder may contain dollar signs
+    draw_title(axes.set_title, title)
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
