@@ -108,7 +108,7 @@ def test_times_that_are_not_kept_are_input_errors() -> None:
     with pytest.raises(InputError, match="no frame has been tracked; track a frame first"):
         StateHistory().at(1.0)
     states = history(*(n / 10 for n in range(200)))
-    with pytest.raises(InputError, match=r"only states of the last 10 s are stored, since 9\.900000 s"):
+    with pytest.raises(InputError, match=r"only states of the last 10 s are stored, since 9\.800000 s"):
         states.at(9.0)
 
 
@@ -117,7 +117,13 @@ def test_states_of_a_long_run_are_forgotten() -> None:
     one = state(0.0)
     for n in range(3000):
         states.append(CameraState(**{**vars(one), "stamp": n / 30}))
-    assert len(states.state_dict()["states"]) == 300
+    assert len(states.state_dict()["states"]) == 301
+
+
+def test_pose_ten_seconds_before_the_last_frame_is_interpolated() -> None:
+    states = history(1.0, 1.3, 1.6, 11.4)
+    assert [each.stamp for each in states.state_dict()["states"]] == [1.3, 1.6, 11.4]
+    torch.testing.assert_close(states.at(1.4).T_wc, START @ se3_exp(TWIST * 1.4))
 
 
 def test_correction_of_the_world_moves_all_states() -> None:

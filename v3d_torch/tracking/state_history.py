@@ -25,8 +25,11 @@ class StateHistory:
         self._states: tuple[CameraState, ...] = ()  # replaced and never changed, so that threads can read it
 
     def append(self, state: CameraState) -> None:
-        """Append the state at a frame, and remove states that are more than 10 s older."""
-        first = bisect_right(self._states, state.stamp - _DURATION, key=_stamp)
+        """Append the state at a frame, and remove those before the last state that is at least 10 s older.
+
+        The last one is kept, because the pose 10 s ago is interpolated between it and the next.
+        """
+        first = max(bisect_right(self._states, state.stamp - _DURATION, key=_stamp) - 1, 0)
         end = bisect_left(self._states, state.stamp, key=_stamp)
         self._states = (*self._states[first:end], state)
 
