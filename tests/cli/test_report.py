@@ -131,6 +131,8 @@ def test_command_writes_one_self_contained_page(reported: tuple[Path, subprocess
     assert "<script" not in html and "@import" not in html and "<link" not in html
     assert not re.search(r"url\((?!#)", html)
     assert page.images == 4  # masks, objects, votes, clusters
+    frame, clouds = page.text.index("Frame with the most votes"), page.text.index("objects in the frame with the most")
+    assert frame < clouds < page.text.index("The room from above")
     assert "copy <b>& " in page.text  # escaped, so not parsed as markup
     metrics = json.loads((folder / "metrics.json").read_text())
     for number in (f"{metrics['ate']['rmse']:.4f} m", f"{metrics['rpe']['trans']['rmse']:.4f} m/s", f"{FRAMES} of"):

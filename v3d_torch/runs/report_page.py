@@ -28,10 +28,10 @@ _FIGURES = {
     "masks.png": "Frames with the mask of each object in the colour of its motion state.",
     "voting.png": "Frame with the most votes for dynamic objects: a line connects two objects, one of which voted for"
     " the other.",
+    "clusters.png": "Point clouds of the objects in the frame with the most votes, before and after outlier rejection.",
     "objects.png": "The room from above: path and last box of each object in the colour of its motion state, with an"
     " arrow to where a dynamic object would be a second later.",
     "occupancy.png": "Occupancy map from above: free and occupied floor, and the distance to obstacles.",
-    "clusters.png": "Point clouds of the objects in the same frame, before and after outlier rejection.",
 }
 """Caption of each picture in the folder ``figures`` of a run."""
 
