@@ -44,10 +44,9 @@ class SlamNode(Node):
         self.camera = v3d.PinholeCamera(*pinhole, depth_scale=1000, distortion_model=info.distortion_model)  # REP 118
         self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
-        self._count = 0
         self._messages = RunMessages(self.camera)
         self._store = get_typestore(Stores.ROS2_HUMBLE)
-        self._topics = {}
+        self._count, self._topics = 0, {}
         qos = {"qos_profile": qos_profile_sensor_data}
         subscribers = [message_filters.Subscriber(self, Image, topic, **qos) for topic in (COLOUR, DEPTH)]
         self._images = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=5, slop=0.02)
@@ -70,11 +69,12 @@ class SlamNode(Node):
                 self._publish(topic, message)
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
-        stamps = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
+        times = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
+        stamp = times[0] + 5e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
         try:
             rgb, measured = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
             images = rgb, measured, self.camera
-            frame = v3d.RGBDFrame.from_arrays(self._count, stamps[0], *images, depth_delay=stamps[1] - stamps[0])
+            frame = v3d.RGBDFrame.from_arrays(self._count, stamp, *images, depth_delay=times[1] - times[0])
         except v3d.InputError as error:
             self.get_logger().warning(f"a frame is skipped: {error}")
         else:

@@ -25,6 +25,8 @@ from v3d_torch.export.ros.frames import map_frame
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
 
+TIMES = [1_700_000_005 * 10**9 + index * 10**8 + 37 * index for index in range(FRAMES)]
+"""Times of the images, nanoseconds."""
 NODE = Path(__file__).parents[2] / "examples" / "ros2_node.py"
 
 
@@ -32,10 +34,11 @@ def images(node: Any) -> Iterator[Pair]:
     """Yield the images along the wall, each after the one before was tracked, as the real messages hold them."""
     factory, wall = MessageFactory("mcap"), Wall()
     for index in range(FRAMES):
-        frame, stamp = wall[index], 5 + index / 10
-        colour = factory.image(stamp, "rgb8", frame.image.permute(1, 2, 0).numpy())
-        depth = factory.image(stamp + 0.01, "16UC1", np.full((240, 320), 1000 * WALL, np.uint16))
-        for message in (colour, depth):
+        frame = wall[index]
+        colour = factory.image(0, "rgb8", frame.image.permute(1, 2, 0).numpy())
+        depth = factory.image(0, "16UC1", np.full((240, 320), 1000 * WALL, np.uint16))
+        for message, time_of_image in ((colour, TIMES[index]), (depth, TIMES[index] + 10**7)):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_of_image, 10**9)
             object.__setattr__(message, "data", array("B", message.data.tobytes()))
         yield colour, depth
         while len(node.slam.poses) <= index:
@@ -98,9 +101,16 @@ def test_map_is_kept_for_nodes_that_subscribe_later(ros: FakeROS) -> None:
 def test_odometry_follows_the_camera_to_the_right(ros: FakeROS) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     poses = [store.deserialize_cdr(message, kind) for kind, message in ros.published["/odom"]]
-    assert [pose.header.stamp.sec for pose in poses] == [5] * 10 + [6] * (FRAMES - 10)
     right = [-matrix_of(pose.pose.pose)[1, 3] for pose in poses]  # y points left
     np.testing.assert_allclose(right, np.arange(FRAMES) * STEP * WALL / CAMERA.fx, atol=0.02)
+
+
+def test_poses_are_known_at_the_times_of_their_images(ros: FakeROS) -> None:
+    """A pose that is a little earlier is of no use to tf2: it waits for the next one."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    stamps = [store.deserialize_cdr(message, kind).header.stamp for kind, message in ros.published["/odom"]]
+    late = [stamp.sec * 10**9 + stamp.nanosec - time for stamp, time in zip(stamps, TIMES, strict=True)]
+    assert min(late) >= 0 and max(late) < 1000
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
