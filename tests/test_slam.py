@@ -270,38 +270,66 @@ def test_objects_seen_by_a_lost_camera_move_into_the_map_when_it_is_found() -> N
         torch.testing.assert_close(centroid, plain[stamp], rtol=0, atol=0.03)
 
 
+LOOP_FRAME = 10
+LOOP_CORRECTION = se3_exp(torch.tensor([0.8, 0.0, 0.4, 0.0, 0.2, 0.0], dtype=torch.float64))
+
+
+def walk_with_loop(T_new_old: Tensor, *, is_measured: bool) -> tuple[V3DSLAM, FrameResult]:
+    """Track frames up to one in which a loop moves the map; return its result.
+
+    Args:
+        T_new_old: Correction of the world by the loop, shape (4, 4).
+        is_measured: False if the camera motion before this frame is not measured.
+    """
+    walk, slam = Walk(), V3DSLAM(WALK_CAMERA, UprightSegmenter(segment_red), WALK_CONFIG)
+    odometry, apply = slam.odometry, slam.back_end.apply
+
+    def interrupt(previous: TrackedFrame | None, current: TrackedFrame, *rest: Any) -> CameraMotion:
+        motion = odometry(previous, current, *rest)
+        is_last = current.frame.index == LOOP_FRAME
+        return replace(motion, is_measured=is_measured) if is_last else motion
+
+    def close_loop(result: BackEndResult) -> Tensor | None:
+        apply(result)
+        if len(slam.poses) != LOOP_FRAME:
+            return None
+        slam.map.move_keyframes(slam.map.T_cw @ invert(T_new_old))
+        return T_new_old
+
+    slam.odometry = interrupt
+    slam.back_end.apply = close_loop  # type: ignore[method-assign]
+    *_, result = [slam(walk[index]) for index in range(LOOP_FRAME + 1)]
+    assert result.status is TrackingStatus.TRACKED
+    return slam, result
+
+
 def test_loop_closed_after_an_unmeasured_motion_corrects_objects_once() -> None:
-    walk, loop_frame = Walk(), 10
-
     def places(T_new_old: Tensor) -> dict[float, Tensor]:
-        """Return the centroids of the person by their times, if a loop moves the map when a frame is tracked."""
-        slam = V3DSLAM(WALK_CAMERA, UprightSegmenter(segment_red), WALK_CONFIG)
-        odometry, apply = slam.odometry, slam.back_end.apply
-
-        def interrupt(previous: TrackedFrame | None, current: TrackedFrame, *rest: Any) -> CameraMotion:
-            motion = odometry(previous, current, *rest)
-            return replace(motion, is_measured=motion.is_measured and current.frame.index != loop_frame)
-
-        def close_loop(result: BackEndResult) -> Tensor | None:
-            apply(result)
-            if len(slam.poses) != loop_frame:
-                return None
-            slam.map.move_keyframes(slam.map.T_cw @ invert(T_new_old))
-            return T_new_old
-
-        slam.odometry = interrupt
-        slam.back_end.apply = close_loop  # type: ignore[method-assign]
-        statuses = [slam(walk[index]).status for index in range(loop_frame + 1)]
-        assert statuses[-1] is TrackingStatus.TRACKED
+        """Return the centroids of the person by their times."""
+        slam, _ = walk_with_loop(T_new_old, is_measured=False)
         people = [track for track in slam.classify_motion.tracker.tracks if track.label == PERSON]
         return {detection.stamp: detection.centroid for track in people for detection in track.detections}
 
-    T_new_old = se3_exp(torch.tensor([0.8, 0.0, 0.4, 0.0, 0.2, 0.0], dtype=torch.float64))
-    plain, corrected = places(torch.eye(4, dtype=torch.float64)), places(T_new_old)
+    plain, corrected = places(torch.eye(4, dtype=torch.float64)), places(LOOP_CORRECTION)
     assert corrected.keys() >= {0.9, 1.0} and corrected.keys() == plain.keys()
     for stamp, centroid in corrected.items():
-        expected = T_new_old[:3, :3] @ plain[stamp] + T_new_old[:3, 3]
+        expected = LOOP_CORRECTION[:3, :3] @ plain[stamp] + LOOP_CORRECTION[:3, 3]
         torch.testing.assert_close(centroid, expected, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize("is_measured", [True, False])
+def test_objects_of_a_frame_that_corrects_the_world_are_in_the_world_of_its_pose(is_measured: bool) -> None:
+    def places(T_new_old: Tensor) -> list[Tensor]:
+        """Return position, velocity, earlier positions and cloud of the person in the frame of the camera."""
+        _, result = walk_with_loop(T_new_old, is_measured=is_measured)
+        (person,) = [each for each in result.objects if each.label == PERSON]
+        R, t = invert(result.T_wc)[:3, :3], invert(result.T_wc)[:3, 3]
+        points = [person.state.position, *(state.position for state in person.history), *person.cloud.double()]
+        return [torch.stack(points) @ R.T + t, R @ person.state.velocity]
+
+    plain, corrected = places(torch.eye(4, dtype=torch.float64)), places(LOOP_CORRECTION)
+    torch.testing.assert_close(corrected[0], plain[0], rtol=0, atol=0.01)
+    torch.testing.assert_close(corrected[1], plain[1], rtol=0, atol=0.1)
 
 
 def test_array_instead_of_a_frame_is_rejected(demo: RGBDSequence) -> None:

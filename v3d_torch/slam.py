@@ -248,6 +248,7 @@ class V3DSLAM(FramePreprocessor):
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
                 self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate())
+        objects = self.classify_motion.apply_corrections(objects)  # the world, since the objects were tracked
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:

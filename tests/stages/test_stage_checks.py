@@ -178,7 +178,7 @@ def test_stage_that_cannot_be_called_is_rejected_at_once(stage: Any) -> None:
     [
         (
             "classify_motion",
-            "^classify_motion was replaced by a stage without tracker; derive it from MotionCla",
+            "^classify_motion was replaced by a stage without apply_corrections; derive it from MotionCla",
         ),
         ("free_space_check", "^free_space_check was replaced by a stage without make_view; derive it from FreeSpaceCh"),
         (

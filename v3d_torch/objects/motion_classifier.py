@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import isnan
 from typing import Any
 
@@ -114,13 +115,11 @@ class MotionClassifier:
                 id=track.id,
                 label=track.label,
                 mask=_visible_mask(track, detected_masks),
-                state=track.predict_state(stamp),
-                history=tuple(track.history),
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
                 motion_state=motion_state,
                 missed=track.missed,
-                cloud=track.newest.cloud,
+                **_place(track, stamp),
             )
             for track, motion_state in motion_states.items()
         ]
@@ -130,6 +129,15 @@ class MotionClassifier:
         people = [track for track in tracks if track.label == PERSON]
         masks = static_masks(excluded, people, view, newly_occupied, config, self._camera)
         return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
+
+    def apply_corrections(self, objects: FrameObjects) -> FrameObjects:
+        """Return the objects of the last frame in the world frame to which the tracker was corrected since then.
+
+        Args:
+            objects: Result of the last call. Objects that the tracker does not have are left as they are.
+        """
+        places = {track.id: _place(track, self._last_stamp) for track in self.tracker.tracks}
+        return replace(objects, objects=[replace(each, **places.get(each.id, {})) for each in objects.objects])
 
     def propagate_instances(self, view: DepthView) -> Instances:
         """Redraw the objects of the previous frame in a frame without segmentation; see `mask_propagation`.
@@ -206,6 +214,11 @@ class MotionClassifier:
         """Check whether tracking can use the pixels of an object with this motion state."""
         deforming = motion_state is MotionState.DEFORMING and self._config.chamfer.keep_deforming_features
         return deforming or motion_state is MotionState.STATIC
+
+
+def _place(track: Track, stamp: float) -> dict[str, Any]:
+    """Return the attributes of a `TrackedObject` in the world frame."""
+    return {"state": track.predict_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}
 
 
 def _unions_of_masks(tracks: Sequence[Track], labels: set[int]) -> dict[int, NDArray[np.bool_]]:
