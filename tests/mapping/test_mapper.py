@@ -45,7 +45,23 @@ def test_keyframe_is_inserted_when_tracking_gets_weak() -> None:
     assert feed(0, LOST)
     assert [feed(matched) for matched in (300, 290, 211, 209)] == [False, False, False, True]
     assert [feed(matched) for matched in (150, 110, 104)] == [False, False, True]  # below 0.7 of 150
-    assert [feed(matched) for matched in (120, 101, 99)] == [False, False, True]  # below the minimum count
+    assert [feed(matched) for matched in (120, 110, 101, 99)] == [False, False, False, True]  # below the minimum count
+
+
+def test_keyframes_keep_a_distance_where_images_show_few_landmarks() -> None:
+    feed = FrameFeeder(max_keyframe_interval=100, min_tracked=100, min_tracked_ratio=0.7)
+    assert feed(0, LOST, feature_count=100)
+    inserted = [feed(60, feature_count=100) for _ in range(12)]
+    assert [index for index, is_keyframe in enumerate(inserted, 1) if is_keyframe] == [4, 8, 12]
+
+
+def test_frame_without_new_landmarks_is_a_keyframe_only_after_the_maximum_interval() -> None:
+    feed = FrameFeeder(max_keyframe_interval=20, min_tracked=100, min_tracked_ratio=0.7)
+    assert feed(0, LOST) and not feed(300)
+    inserted = [feed(60, feature_count=79) for _ in range(20)]  # 19 features without a landmark
+    assert [index for index, is_keyframe in enumerate(inserted, 2) if is_keyframe] == [20]
+    feed(300)
+    assert feed(60, feature_count=80)
 
 
 def test_keyframe_is_inserted_after_the_maximum_interval() -> None:

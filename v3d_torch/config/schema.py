@@ -317,9 +317,10 @@ class MappingConfig(Section):
     """Maximum number of frames between keyframes."""
     min_tracked_ratio: float = Field(0.75, gt=0, le=1)
     """A frame becomes a keyframe if its number of tracked landmarks, divided by the highest number of a frame since the
-    last keyframe, is lower (ORB-SLAM2 for RGB-D)."""
+    last keyframe, is lower (ORB-SLAM2 for RGB-D), and if it adds `tracking.min_inliers` landmarks."""
     min_tracked: int = Field(100, gt=0)
-    """A frame becomes a keyframe if it tracks fewer landmarks."""
+    """A frame becomes a keyframe if it tracks fewer landmarks, adds `tracking.min_inliers` landmarks, and is at least
+    the fourth after the last keyframe."""
     map_by_odometry_after: float = Field(0.5, ge=0)
     """Time since the camera was last tracked in the map after which keyframes are created with the pose of the
     odometry, seconds. Odometry drifts, and usually the camera is tracked in the map again earlier."""

@@ -13,6 +13,10 @@ from v3d_torch.mapping.landmark_fusion import LandmarkFusion
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
 
+_MIN_INTERVAL = 4
+"""Minimum number of frames between keyframes if the landmarks are few but the view has not changed: where an image
+never shows ``mapping.min_tracked`` landmarks, every frame would become a keyframe."""
+
 
 class Mapper:
     """Decides when a frame becomes a keyframe, and inserts the keyframe into the map.
@@ -74,8 +78,13 @@ class Mapper:
         if pose.status is not TrackingStatus.TRACKED:
             return self._needs_untracked_keyframe(frame.stamp, features, pose.status)
         self._untracked_since = None
-        weak = pose.count < max(config.min_tracked, config.min_tracked_ratio * self._most_tracked)
-        return weak or frame.index - self.map.keyframes[-1].frame >= config.max_keyframe_interval
+        interval = frame.index - self.map.keyframes[-1].frame
+        if interval >= config.max_keyframe_interval:
+            return True
+        view_changed = pose.count < config.min_tracked_ratio * self._most_tracked
+        weak = view_changed or (pose.count < config.min_tracked and interval >= _MIN_INTERVAL)
+        new_landmarks = (pose.landmarks < 0) & (features.depth > 0)
+        return weak and int(new_landmarks.sum()) >= self._config.tracking.min_inliers
 
     def _needs_untracked_keyframe(self, stamp: float, features: Features, status: TrackingStatus) -> bool:
         """Decide whether to extend the map from a pose that was not tracked in the map.
