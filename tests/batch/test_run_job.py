@@ -1,4 +1,4 @@
-"""Execution of one job: continuation from its checkpoint."""
+"""Execution of one job: continuation from its checkpoint, and folders to which another run writes."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from helpers.batches import plan_seeds, repeat_sequence
 
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.result_folder import lock_results
 
 
 def stop_after(frames: int) -> tuple[list[int], Callable[[int], None]]:
@@ -35,3 +36,13 @@ def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tm
     progress = []
     assert run_job(moved, progress.append) is None
     assert progress == [5, 6, 7, 8]
+
+
+def test_job_keeps_the_files_of_a_folder_to_which_another_run_writes(moment: Path, tmp_path: Path) -> None:
+    (job,) = plan_seeds(moment, tmp_path / "out", seeds=1)
+    with lock_results(job.folder):
+        for name in ("run.log", "metrics.json"):
+            (job.folder / name).write_text("of the other run")
+        failure = run_job(job, [].append)
+        assert failure is not None and failure.startswith(f"{job.folder}: another run is writing to this folder")
+        assert {path.read_text() for path in job.folder.glob("*.*") if path.suffix != ".lock"} == {"of the other run"}

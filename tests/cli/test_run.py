@@ -27,7 +27,7 @@ from typer.testing import Result
 from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
-from v3d_torch.runs.result_folder import clear_earlier_results
+from v3d_torch.runs.result_folder import clear_earlier_results, lock_results
 
 OBJECT_FILES = {"figures/voting.png", "figures/clusters.png", "figures/objects.png"}
 """Files that are written if objects were detected and voted on."""
@@ -107,6 +107,15 @@ def test_every_file_of_a_run_is_removed_before_the_next_one(sequence: Path, tmp_
     assert any(name.startswith("masks/") for name in written)
     clear_earlier_results(tmp_path / "out")
     assert files_in(tmp_path / "out") == {"run.log"}
+
+
+def test_folder_to_which_another_run_writes_is_an_error_and_stays(sequence: Path, tmp_path: Path) -> None:
+    with lock_results(tmp_path / "out"):
+        for name in ("run.log", "metrics.json"):
+            (tmp_path / "out" / name).write_text("of the other run")
+        done = call_here("--seq", sequence, "--segmenter", "none", "--out", "out", cwd=tmp_path)
+        assert_error_line(done, "out: another run is writing to this folder")
+        assert {(tmp_path / "out" / name).read_text() for name in ("run.log", "metrics.json")} == {"of the other run"}
 
 
 def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Path, tmp_path: Path) -> None:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import subprocess
+import sys
 from datetime import datetime, tzinfo
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
 from v3d_torch.errors import OutputError
 from v3d_torch.runs import result_folder
@@ -42,3 +45,45 @@ def test_make_result_folder_that_fails_raises_output_error(tmp_path: Path, monke
     monkeypatch.chdir(tmp_path)
     with pytest.raises(OutputError, match=r"demo: cannot be made \(.*\); choose another folder with --out"):
         result_folder.make_result_folder(None, "demo")
+
+
+_HOLD = """
+import sys
+from pathlib import Path
+from v3d_torch.runs.result_folder import lock_results
+with lock_results(Path(sys.argv[1])):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_folder_of_another_run_cannot_be_locked_until_that_run_ends_or_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    for kill in (False, True):
+        with subprocess.Popen(  # noqa: S603
+            [sys.executable, "-c", _HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as other:
+            assert other.stdout is not None and other.stdout.readline() == "locked\n"
+            with (
+                pytest.raises(OutputError, match=r"out: another run is writing to this folder; wait .* --out$"),
+                result_folder.lock_results(folder),
+            ):
+                pass
+            if kill:
+                other.kill()
+            other.communicate()
+        with result_folder.lock_results(folder):
+            assert [path.name for path in folder.iterdir()] == [".run.lock"]
+        assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOLCK, "No locks available"), NotImplementedError()])
+def test_folder_on_a_file_system_without_locks_is_used_without_one(
+    error: Exception, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(FileLock, "acquire", refuse)
+    with result_folder.lock_results(tmp_path / "out"):
+        assert (tmp_path / "out").is_dir()

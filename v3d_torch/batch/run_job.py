@@ -10,10 +10,11 @@ from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError, V3DError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.pipeline import FrameCallback
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
 from v3d_torch.runs.log import log_to
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
-from v3d_torch.runs.result_folder import clear_earlier_results
+from v3d_torch.runs.result_folder import clear_earlier_results, lock_results
 from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.types import RGBDFrame
@@ -35,22 +36,28 @@ def run_job(job: Job, report_progress: Callable[[int], None]) -> str | None:
         report_progress(frame.index + 1)
 
     try:
-        checkpoint = _matching_checkpoint(job)
-        if checkpoint is None:
-            clear_earlier_results(job.folder)
-        with log_to(job.folder / "run.log", append=checkpoint is not None):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
-                warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run
-                sequence = load_sequence(job.source, data_root=job.data_root, skip_broken=job.skip_broken)
-            if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
-                clear_earlier_results(job.folder)
-                checkpoint = None
-            segment = make_segmenter(job.config, sequence.camera)
-            run = Run(_make_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
-            run(on_frame)
+        with lock_results(job.folder):
+            return _run(job, on_frame)
     except Exception as error:  # continue the batch after an error in one run; its log has the traceback
         return describe_error(error)
+
+
+def _run(job: Job, on_frame: FrameCallback) -> str | None:
+    """Run a sequence in a folder to which no other run writes; return the error message of the run."""
+    checkpoint = _matching_checkpoint(job)
+    if checkpoint is None:
+        clear_earlier_results(job.folder)
+    with log_to(job.folder / "run.log", append=checkpoint is not None):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
+            warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run
+            sequence = load_sequence(job.source, data_root=job.data_root, skip_broken=job.skip_broken)
+        if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
+            clear_earlier_results(job.folder)
+            checkpoint = None
+        segment = make_segmenter(job.config, sequence.camera)
+        run = Run(_make_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
+        run(on_frame)
     return run.pipeline.record.failure
 
 

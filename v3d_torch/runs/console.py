@@ -16,7 +16,7 @@ from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.log import log_to, show_warnings
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
-from v3d_torch.runs.result_folder import clear_earlier_results
+from v3d_torch.runs.result_folder import clear_earlier_results, lock_results
 from v3d_torch.runs.run import Run
 
 
@@ -40,17 +40,18 @@ def run_with_progress(
         The pipeline that ran, and the scores if there is ground truth.
 
     Raises:
-        OutputError: If the results cannot be written.
+        OutputError: If another run is writing to the folder, or the results cannot be written.
     """
-    if checkpoint is None:
-        clear_earlier_results(folder)
-    compile_kernels(console)
-    log = log_to(folder / "run.log", append=checkpoint is not None)
-    warnings = show_warnings(partial(console.print, markup=False))
-    with progress_bars(console) as progress, interrupts_between_frames(sequence) as interrupted, log, warnings:
-        run = make_run()
-        total = len(sequence) if isinstance(sequence, Sized) else None
-        done = 0 if checkpoint is None else checkpoint.frames
-        evaluation = run(TrackingBar(progress, total, interrupted, done))
-    run.pipeline.record.interrupted |= interrupted.is_set()  # includes Ctrl-C while results were written
-    return run.pipeline, evaluation
+    with lock_results(folder):
+        if checkpoint is None:
+            clear_earlier_results(folder)
+        compile_kernels(console)
+        log = log_to(folder / "run.log", append=checkpoint is not None)
+        warnings = show_warnings(partial(console.print, markup=False))
+        with progress_bars(console) as progress, interrupts_between_frames(sequence) as interrupted, log, warnings:
+            run = make_run()
+            total = len(sequence) if isinstance(sequence, Sized) else None
+            done = 0 if checkpoint is None else checkpoint.frames
+            evaluation = run(TrackingBar(progress, total, interrupted, done))
+        run.pipeline.record.interrupted |= interrupted.is_set()  # includes Ctrl-C while results were written
+        return run.pipeline, evaluation

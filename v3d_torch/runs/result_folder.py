@@ -1,17 +1,27 @@
-"""Folder of the results of a run: created by name or time, cleared of an earlier run."""
+"""Folder of the results of a run: created by name or time, locked, cleared of an earlier run."""
 
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from datetime import datetime
+from errno import ENOLCK, ENOSYS, EOPNOTSUPP
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from v3d_torch.errors import OutputError
 from v3d_torch.io.paths import folder_name
 
 _LOG = "run.log"
 """Name of the log, which every run writes first: a folder with this file contains results of a run."""
+
+_LOCK = ".run.lock"
+"""Name of the lock file, which exists while a run writes."""
+
+_NO_LOCKS = (ENOLCK, ENOSYS, EOPNOTSUPP)
+"""Error numbers of file systems without locks."""
 
 _RESULTS = (
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json"),
@@ -70,15 +80,44 @@ def _make_folder_by_time(runs: Path) -> Path:
             return folder
 
 
+@contextmanager
+def lock_results(folder: Path) -> Iterator[None]:
+    """Keep other runs from writing to a folder, which is made if it is missing, until the end of the block.
+
+    The lock of a process that is killed ends with it. On a file system without locks, nothing is locked.
+
+    Raises:
+        OutputError: If another run is writing to the folder, or if it cannot be written.
+    """
+    lock = FileLock(folder / _LOCK)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise OutputError(
+            f"{folder}: another run is writing to this folder; wait until it ends, or choose another folder with --out"
+        ) from error
+    except NotImplementedError:  # older versions of filelock raise it for ENOSYS
+        pass
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise _unwritable_error(folder, error) from error
+    try:
+        yield
+    finally:
+        with suppress(OSError):  # Windows removes the file of a lock only when it is released
+            (folder / _LOCK).unlink()
+        lock.release()
+
+
 def clear_earlier_results(folder: Path) -> None:
-    """Remove the results of an earlier run from a folder, which is made if it is missing; other files stay.
+    """Remove the results of an earlier run from a folder; other files stay.
 
     Raises:
         OutputError: If the folder has files with the names of results but no log of a run (they can be the user's
             own, such as a ground truth), or if it cannot be written.
     """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         earlier = [path for pattern in (*_RESULTS, *_UNFINISHED) for path in sorted(folder.glob(pattern))]
         if earlier and not (folder / _LOG).is_file():
             raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
@@ -88,9 +127,11 @@ def clear_earlier_results(folder: Path) -> None:
             with suppress(OSError):  # missing, or with other files in it
                 subfolder.rmdir()
     except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot be written ({error.strerror}); choose another folder with --out"
-        ) from error
+        raise _unwritable_error(folder, error) from error
+
+
+def _unwritable_error(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"{folder}: cannot be written ({error.strerror}); choose another folder with --out")
 
 
 def remove_unfinished(folder: Path) -> None:
