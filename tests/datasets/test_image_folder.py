@@ -11,6 +11,7 @@ from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of, depth_of, save
 from v3d_torch.datasets import RGBDSequence, SourceOptions, load_sequence
 from v3d_torch.datasets.image_files import frame_number, list_images, stamp_in_name
 from v3d_torch.datasets.image_folder import ImageFolder
+from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import InputError
 
 FPS = SourceOptions(fps=10)
@@ -68,6 +69,23 @@ def test_images_with_timestamps_as_names_are_paired_by_time(root: Path) -> None:
     colour = [f"rgb/{t}.png" for t in ("1305031102.5", "1305031102.12", "1305031103.0")]
     fill(root, colour, [f"depth/{t}.png" for t in ("1305031102.51", "1305031102.11", "1305031109.0")])
     assert_frames(load_sequence(str(root)), [1305031102.12, 1305031102.5], [(1, 1), (0, 0)])
+
+
+def test_depth_delay_is_the_same_with_and_without_lists(root: Path) -> None:
+    stamps = [("1305031102.50", "1305031102.51"), ("1305031102.60", "1305031102.585")]
+    fill(root, [f"rgb/{colour}.png" for colour, _ in stamps], [f"depth/{depth}.png" for _, depth in stamps])
+    assert [frame.depth_delay for frame in load_sequence(str(root), options=FPS)] == [0, 0]
+    delays = [frame.depth_delay for frame in load_sequence(str(root))]
+    assert delays == pytest.approx([0.01, -0.015], abs=1e-6)
+    for kind, names in zip(("rgb", "depth"), zip(*stamps, strict=True), strict=True):
+        (root / f"{kind}.txt").write_text("".join(f"{name} {kind}/{name}.png\n" for name in names))
+    listed = load_sequence(str(root))
+    assert isinstance(listed, TUMSequence) and [frame.depth_delay for frame in listed] == delays
+
+
+def test_depth_delay_is_zero_if_only_names_of_colour_are_timestamps(root: Path) -> None:
+    fill(root, [f"rgb/{t}.png" for t in ("1.5", "1.6")], [f"depth/{i}.png" for i in range(2)])
+    assert [frame.depth_delay for frame in load_sequence(str(root))] == [0, 0]
 
 
 def test_timestamps_with_few_decimals_are_sorted_by_value(root: Path) -> None:

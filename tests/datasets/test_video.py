@@ -55,6 +55,14 @@ def test_fps_of_the_user_sets_the_timestamps(folder: Path) -> None:
     assert_frame(sequence, 2, 2, 2)
 
 
+def test_depth_delay_is_the_difference_of_the_timestamps(folder: Path) -> None:
+    write_video(folder / "depth.mkv", 25, [depth_of(i) for i in range(3)])
+    frames = list(load_sequence(str(folder)))
+    assert [frame.stamp for frame in frames] == pytest.approx([0, 1 / 30, 2 / 30], abs=1e-6)
+    assert [frame.depth_delay for frame in frames] == pytest.approx([0, 1 / 25 - 1 / 30, 2 / 25 - 2 / 30], abs=1e-6)
+    assert [frame.depth_delay for frame in load_sequence(str(folder), options=SourceOptions(fps=10))] == [0, 0, 0]
+
+
 def test_pair_is_found_by_name_among_several_videos(folder: Path) -> None:
     write_colour(folder / "second.mkv", 15, 2)
     write_video(folder / "second_depth.mkv", 15, [depth_of(7), depth_of(8)])

@@ -31,6 +31,7 @@ class SimulatedDevice:
         scale: Integer factor by which the small images are enlarged.
         still: True to send frame 0 again and again.
         accelerations: Measurements of the accelerometer, m/s^2, shape (N, 3); None if there is none.
+        depth_delay: Time of a depth image minus time of its colour image, seconds.
     """
 
     depth_unit, serial = 0.001, "1"
@@ -42,8 +43,10 @@ class SimulatedDevice:
         scale: int = 1,
         still: bool = False,
         accelerations: NDArray[np.float64] | None = None,
+        depth_delay: float = 0.0,
     ) -> None:
         self._scale, self._still = scale, still
+        self._depth_delay = depth_delay
         self.accelerations = np.zeros((0, 3)) if accelerations is None else accelerations
         self.device = rs.software_device()
         self.device.register_info(rs.camera_info.name, "Simulated")
@@ -122,6 +125,7 @@ class SimulatedDevice:
         frame.frame_number = self.sent_count
         if sensor == "Depth":
             frame.depth_units = 0.001
+            frame.timestamp += self._depth_delay * 1000
         self._sensors[sensor].on_video_frame(frame)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import list_images, stamp_in_name
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair, check_stamp_unit
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair, check_stamp_unit, depth_delay
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import associate
@@ -49,7 +49,11 @@ class ImageFolder(PairedImages):
         files = _pair(folder, colour, depth)
         stamps = _stamps(folder, colour, [path for path, _ in files], fps)
         pairs = [
-            ImagePair(stamp, *(str(path.relative_to(folder)) for path in pair))
+            ImagePair(
+                stamp,
+                *(str(path.relative_to(folder)) for path in pair),
+                depth_delay=_delay(stamp, pair[1]) if fps is None else 0.0,
+            )
             for stamp, pair in sorted(dict(zip(stamps, files, strict=True)).items())
         ]
         if fps is None:
@@ -145,3 +149,9 @@ def _stamps(folder: Path, colour: list[Path], paired: list[Path], fps: float | N
             f"{folder}: file names such as {paired[0].name} are not timestamps; pass the frame rate with --fps"
         )
     return stamps
+
+
+def _delay(stamp: float, depth: Path) -> float:
+    """Depth delay of a frame, seconds; 0 if the name of its depth image is not a timestamp."""
+    depth_stamp = stamp_in_name(depth)
+    return 0.0 if depth_stamp is None else depth_delay(stamp, depth_stamp)

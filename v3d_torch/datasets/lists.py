@@ -112,7 +112,7 @@ def read_associations(path: Path) -> list[ImagePair]:
         path,
     )
     return [
-        ImagePair(stamp, colour, depth, depth_delay=_depth_delay(stamp, depth_stamp))
+        ImagePair(stamp, colour, depth, depth_delay=depth_delay(stamp, depth_stamp))
         for stamp, (colour, depth, depth_stamp) in ordered
     ]
 
@@ -143,8 +143,13 @@ def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
             " check that both lists belong to the same recording"
         )
     return [
-        ImagePair(*images[i], depths[j][1], depth_delay=_depth_delay(images[i][0], depths[j][0])) for i, j in indices
+        ImagePair(*images[i], depths[j][1], depth_delay=depth_delay(images[i][0], depths[j][0])) for i, j in indices
     ]
+
+
+def depth_delay(colour: float, depth: float) -> float:
+    """Return depth stamp minus colour stamp; 0 if they differ so much that they come from different clocks."""
+    return depth - colour if abs(depth - colour) <= MAX_STAMP_DIFFERENCE else 0.0
 
 
 def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
@@ -199,11 +204,6 @@ def _parse_stamp(word: str, path: Path, number: int) -> float:
             f"{path}: line {number} has {word[:80]!r}, expected a timestamp in seconds; correct or remove the line"
         )
     return stamp
-
-
-def _depth_delay(colour: float, depth: float) -> float:
-    """Depth stamp minus colour stamp; 0 if the difference is so large that the stamps come from different clocks."""
-    return depth - colour if abs(depth - colour) <= MAX_STAMP_DIFFERENCE else 0.0
 
 
 def _sort_unique(entries: Iterable[tuple[float, _T]], path: Path) -> list[tuple[float, _T]]:

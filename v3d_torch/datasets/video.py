@@ -74,7 +74,12 @@ class VideoSequence(ImageSequence):
                 f"{colour_path}: no frame is within {MAX_STAMP_DIFFERENCE} s of a frame in {depth_path.name}; check"
                 " that both videos belong to the same recording"
             )
-        super().__init__(path.resolve().stem, [stamps[i] for i, _ in self._pairs], chosen)
+        super().__init__(
+            path.resolve().stem,
+            [stamps[i] for i, _ in self._pairs],
+            chosen,
+            delays=[depth_stamps[j] - stamps[i] for i, j in self._pairs],
+        )
         self._colour_frames = Cursor(partial(_open_frames, colour_path))
         self._depth_frames = Cursor(partial(_open_frames, depth_path, is_depth=True))
         self._settle_depth_scale(path, _SAMPLED_FRAMES)

@@ -97,6 +97,36 @@ def test_yielded_frames_do_not_share_memory(live: SimpleNamespace) -> None:
     assert len({frame.image.numpy().tobytes() for frame in live.frames}) == len(live.frames)
 
 
+def test_depth_delay_is_the_difference_of_the_stamps_of_a_frame() -> None:
+    for kind in (RealSenseStream, RealSenseCamera):
+        camera = SimulatedDevice(depth_delay=0.004)
+        frames = take_frames(kind("simulated", lambda camera=camera: camera), 3)
+        assert [frame.depth_delay for frame in frames] == pytest.approx([0.004] * 3, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth", "delay", "expected"),
+    [
+        ("global_time", "global_time", -0.015, -0.015),
+        ("hardware_clock", "hardware_clock", 0.004, 0.004),
+        ("global_time", "hardware_clock", 0.004, 0.0),
+        ("system_time", "system_time", 0.004, 0.0),
+        ("global_time", "global_time", 0.05, 0.0),
+    ],
+)
+def test_depth_delay_needs_stamps_of_one_clock_of_capture(
+    colour: str, depth: str, delay: float, expected: float
+) -> None:
+    def image(stamp: float, clock: str) -> SimpleNamespace:
+        domain = getattr(rs.timestamp_domain, clock)
+        return SimpleNamespace(get_timestamp=lambda: 1000 * stamp, get_frame_timestamp_domain=lambda: domain)
+
+    first, second = image(1305031102.5, colour), image(1305031102.5 + delay, depth)
+    frames = SimpleNamespace(get_color_frame=lambda: first, get_depth_frame=lambda: second)
+    stream = RealSenseStream("simulated", SimulatedDevice)
+    assert stream._depth_delay(frames) == pytest.approx(expected, abs=1e-6)
+
+
 def test_camera_runs_only_during_iteration() -> None:
     camera = SimulatedDevice()
     stream = RealSenseStream("simulated", lambda: camera)

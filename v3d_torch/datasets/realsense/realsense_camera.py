@@ -15,7 +15,7 @@ from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.gravity import gravity_direction
 from v3d_torch.datasets.realsense.camera import import_librealsense
 from v3d_torch.datasets.realsense.device import Device, open_live_device
-from v3d_torch.datasets.realsense.realsense_stream import RealSenseStream
+from v3d_torch.datasets.realsense.realsense_stream import CapturedImages, RealSenseStream
 from v3d_torch.errors import InputError
 from v3d_torch.types import RGBDFrame
 
@@ -65,14 +65,13 @@ class RealSenseCamera(RealSenseStream):
         while device is not None:
             shift: float | None = None if index else 0.0
             with closing(self._images(device)) as images:
-                while (image := self._next(images, is_first=index == 0)) is not None:
-                    device_stamp, colour, depth = image
+                while (captured := self._next(images, is_first=index == 0)) is not None:
                     now = time.monotonic()
                     if shift is None:
-                        shift = _clock_shift(stamp, stamp + now - arrival, device_stamp)
-                    stamp, arrival = device_stamp + shift, now
-                    self._captured_at = _capture_time(self.name, device_stamp, colour, now)
-                    frame = self._convert_frame(index, stamp, colour, depth, device)
+                        shift = _clock_shift(stamp, stamp + now - arrival, captured.stamp)
+                    stamp, arrival = captured.stamp + shift, now
+                    self._captured_at = _capture_time(self.name, captured.stamp, captured.colour, now)
+                    frame = self._convert_frame(index, stamp, captured, device)
                     yield frame if index else replace(frame, gravity=gravity)
                     index += 1
             device = self._reopen(first.serial)
@@ -91,9 +90,7 @@ class RealSenseCamera(RealSenseStream):
     def _is_stopped(self) -> bool:
         return self._stopped.is_set()
 
-    def _next(
-        self, images: Generator[tuple[float, Any, Any], None, None], *, is_first: bool
-    ) -> tuple[float, Any, Any] | None:
+    def _next(self, images: Generator[CapturedImages, None, None], *, is_first: bool) -> CapturedImages | None:
         """Return the next images; None if the stream was stopped or the camera was unplugged, which is logged."""
         try:
             return next(images, None)

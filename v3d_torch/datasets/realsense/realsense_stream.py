@@ -9,12 +9,13 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from v3d_torch.datasets.camera_fields import check_distortion
 from v3d_torch.datasets.cameras import CameraChoice, load_given_camera
+from v3d_torch.datasets.lists import depth_delay
 from v3d_torch.datasets.realsense.camera import camera_from_intrinsics, depth_scale_from, import_librealsense
 from v3d_torch.datasets.realsense.device import Device, open_recorded_device
 from v3d_torch.datasets.ros import read_topic_types
@@ -28,6 +29,22 @@ _WAIT_MS = 200
 """Maximum wait for one frame set, milliseconds: Ctrl-C and the end of the stream are handled between waits."""
 _SILENCE_TIMEOUT = 5.0
 """Time without frames after which a camera counts as unplugged, seconds."""
+
+
+class CapturedImages(NamedTuple):
+    """Images of one frame.
+
+    Attributes:
+        stamp: Time of the colour image in the clock of the camera, seconds.
+        depth_delay: Depth stamp minus colour stamp, seconds.
+        colour: ``rs.video_frame`` of the colour image.
+        depth: ``rs.depth_frame`` of the depth image, aligned to the colour image.
+    """
+
+    stamp: float
+    depth_delay: float
+    colour: Any
+    depth: Any
 
 
 class RealSenseStream:
@@ -61,11 +78,11 @@ class RealSenseStream:
         """
         device = self._open_device()
         with closing(self._images(device)) as images:
-            for index, (stamp, colour, depth) in enumerate(images):
-                yield self._convert_frame(index, stamp, colour, depth, device)
+            for index, captured in enumerate(images):
+                yield self._convert_frame(index, captured.stamp, captured, device)
 
-    def _images(self, device: Device) -> Generator[tuple[float, Any, Any], None, None]:
-        """Start the device and yield stamp, colour and depth image of each frame; stop the device at the end."""
+    def _images(self, device: Device) -> Generator[CapturedImages, None, None]:
+        """Start the device and yield the images of each frame; stop the device at the end."""
         rs = import_librealsense(self.name)
         align = rs.align(rs.stream.color)
         device.start()
@@ -76,10 +93,21 @@ class RealSenseStream:
                 colour, depth = aligned.get_color_frame(), aligned.get_depth_frame()
                 stamp = colour.get_timestamp() / 1000
                 if stamp > previous_stamp:  # otherwise it is the same colour image, paired with a newer depth image
-                    yield stamp, colour, depth
+                    yield CapturedImages(stamp, self._depth_delay(frames), colour, depth)
                     previous_stamp = stamp
         finally:
             device.stop()
+
+    def _depth_delay(self, frames: Any) -> float:
+        """Depth delay of a frame set, seconds; 0 if the stamps do not tell when its images were captured."""
+        domains = import_librealsense(self.name).timestamp_domain
+        colour, depth = frames.get_color_frame(), frames.get_depth_frame()
+        domain = colour.get_frame_timestamp_domain()
+        if (
+            domain == domains.system_time or domain != depth.get_frame_timestamp_domain()
+        ):  # times of arrival, or 2 clocks
+            return 0.0
+        return depth_delay(colour.get_timestamp() / 1000, depth.get_timestamp() / 1000)
 
     def _wait_for_frames(self, device: Device) -> Iterator[Any]:
         """Yield frame sets with a colour and a depth image until the device ends."""
@@ -99,7 +127,8 @@ class RealSenseStream:
         """Check whether another thread ended the iteration."""
         return False
 
-    def _convert_frame(self, index: int, stamp: float, colour: Any, depth: Any, device: Device) -> RGBDFrame:
+    def _convert_frame(self, index: int, stamp: float, captured: CapturedImages, device: Device) -> RGBDFrame:
+        colour, depth = captured.colour, captured.depth
         encoding = colour.get_profile().format().name
         if encoding not in COLOUR_ENCODINGS:
             raise InputError(f"{self.name}: sends colour in the unsupported format {encoding}; record it as rgb8")
@@ -113,7 +142,8 @@ class RealSenseStream:
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOUR_ENCODINGS[encoding][0])
         units = np.asanyarray(depth.get_data())
         metres = self.camera.correct_depth(depth_to_metres(units, depth_scale_from(device.depth_unit)))
-        return RGBDFrame(index, stamp, convert_to_rgb(encoding, pixels), metres, camera=self.camera)
+        image = convert_to_rgb(encoding, pixels)
+        return RGBDFrame(index, stamp, image, metres, depth_delay=captured.depth_delay, camera=self.camera)
 
 
 def _choose_camera(name: str, device: Device, camera: CameraChoice) -> PinholeCamera:
