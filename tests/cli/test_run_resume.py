@@ -172,9 +172,8 @@ def test_temporarily_full_disk_only_prevents_checkpoints(sequence: Path, whole_r
     with full_from_frame(6), at_frame(11, free_disk):
         done = call(*run_arguments(sequence, out, "--serial", *CHECKPOINT_EVERY_FRAME))
     assert (done.exit_code, done.stderr) == (0, "")
-    assert done.stdout.count("note: no checkpoint was saved, ") == 1
-    assert "cannot be written (File too large)" in done.stdout
-    assert "WARNING no checkpoint: " in (out / "run.log").read_text()
+    assert "note: no checkpoint" not in done.stdout  # later ones were saved
+    assert (out / "run.log").read_text().count("WARNING no checkpoint: ") == 1
     assert (out / "trajectory.txt").read_bytes() == (whole_run / "trajectory.txt").read_bytes()
     assert not list(out.glob(".*")) and not (out / CHECKPOINT).exists()
 

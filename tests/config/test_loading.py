@@ -43,6 +43,8 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("seed=abc", "valid integer"),
         ("objects=3", "valid dictionary"),
         ("seed=[", "not valid YAML"),
+        ("seed=010", "YAML reads a leading zero as octal; write 10 instead"),
+        ("seed= 008", "YAML reads a leading zero as octal; write 8 instead"),
         ("segmentation.height=481", "multiple of 32"),
         ("objects.free_space.baselines=[-0.3]", "free_space.baselines.0: input should be greater than or equal to 0"),
         ("objects.free_space.baselines=[0.3,11]", "free_space.baselines.1: input should be less than or equal to 10"),

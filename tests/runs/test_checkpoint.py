@@ -9,6 +9,7 @@ import torch
 from helpers.differences import differences
 from helpers.walk_run import CONFIG, Walk, interrupt_after, make_pipeline
 
+from v3d_torch.errors import OutputError
 from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs import checkpoint as checkpoint_module
@@ -93,3 +94,24 @@ def test_next_checkpoint_reads_the_sizes_of_new_files_only(tmp_path: Path, monke
         autosave.end()
         assert asked == list(range(stop + 1))
     assert read_checkpoint(tmp_path).sequence["sizes"] == [[3, None]] * 5
+
+
+def test_error_of_a_checkpoint_is_forgotten_when_the_next_one_is_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    pipeline = make_pipeline(prefetch=False)
+    autosave = Autosave(tmp_path, pipeline, RunRequest("walk", CONFIG))
+    pipeline(interrupt_after(2))
+
+    def refuse(*_: object) -> None:
+        raise OutputError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("v3d_torch.runs.autosave.write_checkpoint", refuse)
+        for _ in range(2):
+            autosave.end()
+            assert pipeline.record.save_error == "the disk is full"
+        assert [record.getMessage() for record in caplog.records] == ["no checkpoint: the disk is full"]
+    autosave.end()
+    assert pipeline.record.save_error is None
+    assert read_checkpoint(tmp_path).state["record"].save_error is None

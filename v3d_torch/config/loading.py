@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +22,9 @@ from v3d_torch.io.text import read_text, replace_odd_spaces
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""
+
+_LEADING_ZERO = re.compile(r"[-+]?0\d+")
+"""Integer that is octal in YAML if all its digits are, and decimal otherwise: 010 is 8, and so is 008."""
 
 _DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 """Dumper of libyaml, which writes the same text several times faster. Some builds of PyYAML lack it."""
@@ -118,6 +122,8 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
         tree = tree.setdefault(section, {})
         if not isinstance(tree, dict):
             raise ConfigError(f"--set {override!r}: {section!r} is a value and has no keys")
+    if _LEADING_ZERO.fullmatch(text.strip()):
+        raise ConfigError(f"--set {override!r}: YAML reads a leading zero as octal; write {int(text)} instead")
     try:
         tree[leaf] = parse_yaml(text)
     except ValueError as error:

@@ -22,7 +22,7 @@ class Autosave:
     """Saves results and checkpoints at the intervals of the configuration.
 
     Files of a live run are written in a thread, because frames are lost while tracking waits. If files cannot be
-    written, the run continues, with the reason in ``record.save_error``.
+    written, the run continues, with the reason in ``record.save_error`` until they are written again.
 
     Args:
         folder: Folder of the results.
@@ -42,6 +42,7 @@ class Autosave:
         if isinstance(pipeline.sequence, LiveStream):
             _import_writer()  # takes a second, in which a camera that has started would lose frames
             self._thread = ThreadPoolExecutor(1, "autosave")
+        self._logged_error = ""
 
     def __call__(self) -> None:
         """Save after a frame, if a save is due."""
@@ -93,6 +94,7 @@ class Autosave:
         self._due = end + max(self._config.interval, (end - start) * (1 / self._config.max_time_fraction - 1))
 
     def _write_checkpoint(self) -> None:
+        self._pipeline.record.save_error = None  # before the record is stored in the checkpoint
         if self._request is None:
             return
         start, path = time.perf_counter(), self._folder / CHECKPOINT
@@ -101,9 +103,9 @@ class Autosave:
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)
 
     def _report(self, error: OutputError) -> None:
-        if self._pipeline.record.save_error != str(error):
+        if self._logged_error != str(error):
             _LOG.warning("no checkpoint: %s", error)
-        self._pipeline.record.save_error = str(error)
+        self._pipeline.record.save_error = self._logged_error = str(error)
 
 
 def _import_writer() -> Callable[[Path, Pipeline], Callable[[], None]]:
