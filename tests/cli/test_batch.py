@@ -218,6 +218,19 @@ def test_finished_runs_are_not_overwritten(repaired: tuple[Path, Result, dict[Pa
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
+def test_tables_keep_the_runs_of_an_earlier_batch(
+    repaired: tuple[Path, Result, dict[Path, int]], tmp_path: Path
+) -> None:
+    folder, _, _ = repaired
+    out, data = folder / "out", folder / "data"
+    before = {path: path.read_bytes() for path in out.glob("*.*")}
+    other = repeat_sequence(data / "good", tmp_path / "other", frames=4)
+    for arguments in (("--seqs", data / "good", "--resume"), ("--seqs", other)):
+        result = call(*arguments, "--configs", "baseline", "--out", out)
+        assert_error_line(result, f"{out}: the tables have runs of other sequences", "such as good/few/seed0; give")
+    assert {path: path.read_bytes() for path in out.glob("*.*")} == before and not (out / "other").exists()
+
+
 @pytest.mark.parametrize(
     "change",
     [{"failure": "it broke"}, {"processed": 4}, {"frames": 7, "processed": 7}, None],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import tarfile
 import threading
 from collections.abc import Generator, Iterator, Sequence
@@ -212,7 +213,7 @@ def test_resume_runs_sequences_added_since(server: str, fake_runs: list[str], tm
     arguments = ("--data-root", data, "--out", out)
     assert call(*arguments).exit_code == 0
     first = list(fake_runs)
-    (data / SERVED[0]).rename(data / "rgbd_dataset_freiburg3_walking_static")
+    shutil.copytree(data / SERVED[0], data / "rgbd_dataset_freiburg3_walking_static")
     refused = call(*arguments, "--no-download")
     assert_error_line(refused, out, "--resume")
     result = call(*arguments, "--no-download", "--resume")

@@ -56,6 +56,7 @@ class BatchRecord:
     def __init__(self, jobs: Sequence[Job], folder: Path) -> None:
         self.jobs = jobs
         self.folder = folder
+        self._table = folder / "runs.parquet"
         self._outcomes = {job.folder: outcome for job in jobs if (outcome := job.earlier_outcome()) is not None}
 
     @property
@@ -73,6 +74,12 @@ class BatchRecord:
         """Jobs that have not ended."""
         return [job for job in self.jobs if job.folder not in self._outcomes]
 
+    @property
+    def unplanned(self) -> list[str]:
+        """Folders of runs in the table of an earlier batch that are not jobs of this one, relative to the folder."""
+        planned = {_relative_path(job, self.folder) for job in self.jobs}
+        return [path for path in _read_paths(self._table) if path not in planned]
+
     def add(self, event: JobFinished) -> Outcome:
         """Store the outcome of a job that has ended, and return it."""
         outcome = self._outcomes[event.job.folder] = event.job.make_outcome(event.failure)
@@ -85,7 +92,7 @@ class BatchRecord:
             OutputError: If the folder is not writable or the disk is full.
         """
         ended = [(job, self._outcomes[job.folder]) for job in self.jobs if job.folder in self._outcomes]
-        write_runs(self.folder / "runs.parquet", ended)
+        write_runs(self._table, ended)
         self.write_summaries()
 
     def write_summaries(self) -> None:
@@ -126,5 +133,18 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         **{key.replace(".", "_"): outcome.get_metric(key) for key in METRIC_TYPES},
         "difference": outcome.difference,
         "failure": outcome.failure,
-        "path": job.folder.relative_to(folder).as_posix(),
+        "path": _relative_path(job, folder),
     }
+
+
+def _relative_path(job: Job, folder: Path) -> str:
+    return job.folder.relative_to(folder).as_posix()
+
+
+def _read_paths(table: Path) -> list[str]:
+    """Read the column ``path`` of a table of runs; empty if there is no table that can be read."""
+    try:
+        paths: list[str] = pq.read_table(table, columns=["path"])["path"].to_pylist()
+    except (OSError, pa.ArrowException, KeyError):
+        return []
+    return paths

@@ -71,12 +71,18 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
         resume: True if the folder can contain complete runs; they are not run again.
 
     Raises:
-        V3DError: If the folder contains runs or is not writable, if the user interrupted the batch, or if a run failed.
+        V3DError: If the folder contains runs, or its tables have runs that are not jobs of this batch, or it is not
+            writable; if the user interrupted the batch, or if a run failed.
     """
     folder = record.folder
     if record.outcomes and not resume:
         raise InputError(
             f"{folder}: contains runs of an earlier batch; continue it with --resume, or choose another folder"
+        )
+    if unplanned := record.unplanned:
+        raise InputError(
+            f"{folder}: the tables have runs of other sequences, configurations or seeds, such as {unplanned[0]}; give"
+            " all of them with --resume, or choose another folder with --out"
         )
     record.write()  # a folder that is not writable is an error before the first run
     compile_kernels(console)  # once, and not in each worker
