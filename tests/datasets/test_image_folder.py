@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from errno import EACCES
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +124,20 @@ def test_equal_names_are_preferred_to_names_with_other_zeros(root: Path) -> None
     for frame in sequence:
         (colour,) = (seed for seed in range(3) if np.array_equal(as_rgb(frame.image), colour_of(seed)))
         np.testing.assert_allclose(frame.depth[0], depth_of((colour + 2) % 3) / 1000, rtol=1e-6)
+
+
+def test_folder_beside_the_images_need_not_be_readable(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(root, ["rgb/1.png"], ["depth/1.png"])
+    (root / "lost+found").mkdir()
+    iterdir = Path.iterdir
+
+    def refuse(path: Path) -> Iterator[Path]:
+        if path.name == "lost+found":
+            raise PermissionError(EACCES, "Permission denied", str(path))
+        return iterdir(path)
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    assert_frames(load_sequence(str(root), options=FPS), [0], [(0, 0)])
 
 
 def test_few_images_without_a_partner_are_left_out(root: Path) -> None:

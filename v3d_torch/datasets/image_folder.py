@@ -81,9 +81,10 @@ def _find_images(folder: Path) -> tuple[list[Path], list[Path]]:
 
 def _image_folders(folder: Path) -> tuple[list[Path], list[Path]]:
     """Subfolders with colour and with depth images, by their names."""
-    folders = [entry for entry in sorted(folder.iterdir()) if entry.is_dir() and list_images(entry)]
+    named = [entry for entry in sorted(folder.iterdir()) if _DEPTH.search(entry.name) or _COLOUR.search(entry.name)]
+    folders = [entry for entry in named if entry.is_dir() and list_images(entry)]  # others may not be readable
     depth = [entry for entry in folders if _DEPTH.search(entry.name)]
-    return [entry for entry in folders if entry not in depth and _COLOUR.search(entry.name)], depth
+    return [entry for entry in folders if entry not in depth], depth
 
 
 def _images_side_by_side(folder: Path) -> tuple[list[Path], list[Path]]:
