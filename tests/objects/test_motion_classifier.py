@@ -768,6 +768,18 @@ def test_objects_without_depth_are_static_things_and_unknown_people() -> None:
         assert not result.static_mask[owner == 1].any()
 
 
+def test_person_who_walks_after_a_gap_in_time_is_never_static() -> None:
+    """The person stands for 1.4 s; 2 s later, with nothing observed between, the person walks."""
+    stage = ObjectStage(load_config(None, (STRIDE, NO_UNLABELLED)).objects, CAMERA)
+    stamps = [*(0.2 * i for i in range(8)), *(3.4 + i / 30 for i in range(15))]
+    for stamp in stamps:
+        things = [walker((-0.6 + 0.9 * max(stamp - 3.0, 0.0), 0.1, 2.5), (0.0, 0.0, 0.0))]
+        depth, owner = render(things, stamp, HERE, 0.0)
+        (person,) = stage(stamp, detect(owner, things, set()), depth, HERE).objects
+        assert person.id == 1
+        assert (person.motion_state is MotionState.STATIC) is (1.0 <= stamp < 3.4)
+
+
 def test_one_moving_object_among_a_hundred_is_dynamic() -> None:
     """A grid of small boxes in a plane at 2 m; one in the middle moves towards the camera."""
     places = [(0.22 * c - 1.0, 0.17 * r - 0.77) for r in range(10) for c in range(10)]

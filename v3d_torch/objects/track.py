@@ -88,7 +88,8 @@ class Track:
 
     Attributes:
         id: Number of the object, from 1, never reused.
-        first_stamp: Timestamp of the first detection since the object was last lost, seconds.
+        first_stamp: Timestamp of the first detection since the object was last lost, or not observed for longer than
+            the history, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
@@ -213,12 +214,14 @@ class Track:
         Args:
             detection: Detection, not older than the newest one.
         """
+        oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
+        if self.detections and self.newest.stamp < oldest:  # the next detections have no earlier one to compare with
+            self.first_stamp = detection.stamp
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
         self.vacant_time = self.vacancy = 0.0
         self._remember_state()
         self.detections.append(detection)
-        oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
 
