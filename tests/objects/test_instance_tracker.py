@@ -111,6 +111,16 @@ def test_colours_decide_between_two_people_who_return(compared: bool) -> None:
     assert [at(tracks, board).id for board in (right, left)] == ([1, 2] if compared else [2, 1])
 
 
+def test_appearance_of_any_length_can_be_unknown_for_one_instance() -> None:
+    track_boards = BoardTracker()
+    depth, instances = render([Board(-0.3), Board(0.3)])
+    appearance = torch.stack([torch.full((16,), torch.nan), torch.eye(16)[0]])
+    for frame in range(3):
+        tracks = track_boards.track(depth, instances, frame / 30, appearance=appearance)
+    assert [track.id for track in tracks] == [1, 2]
+    assert tracks[0].appearance is None and torch.equal(tracks[1].appearance, torch.eye(16)[0])
+
+
 def test_class_decides_between_two_equally_distant_instances() -> None:
     """Between two frames a dog and a chair moved by half of their distance."""
     track_boards = BoardTracker(5.0)

@@ -147,7 +147,8 @@ class InstanceTracker(torch.nn.Module):
             track.add_detection(detection)
             track.set_masks(*masks, missed=False)
             track.update_label(int(instances.labels[i]), float(instances.scores[i]))
-            track.update_appearance(detected.appearance[i])
+            if detected.appearance is not None:
+                track.update_appearance(detected.appearance[i])
             updated.append(track)
 
         missed = self._predict_missed_tracks(stamp, depth, predicted, updated)

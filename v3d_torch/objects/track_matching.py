@@ -11,7 +11,7 @@ from torch import Tensor
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
-from v3d_torch.objects.appearance import HISTOGRAM_SIZE, histogram_similarity
+from v3d_torch.objects.appearance import histogram_similarity
 from v3d_torch.objects.association import (
     appearance_log_ratio,
     class_log_ratio,
@@ -49,7 +49,7 @@ class DetectedInstances:
         scores: Score of each instance, 0 if it has none, float32, shape :math:`(N,)`.
         detections: Detections of the instances.
         masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
-        appearance: Colour histograms, float32, shape :math:`(N, D)`; NaN if unknown.
+        appearance: Colour histograms, float32, shape :math:`(N, D)`, NaN if unknown; None if they are not compared.
     """
 
     stamp: float
@@ -57,7 +57,7 @@ class DetectedInstances:
     scores: Tensor
     detections: Sequence[Detection3D]
     masks: Tensor
-    appearance: Tensor
+    appearance: Tensor | None
 
     def __len__(self) -> int:
         return len(self.detections)
@@ -116,7 +116,7 @@ def detect_instances(
         instances.scores,
         detections,
         pack_masks(instances.masks, stride),
-        torch.full((len(detections), HISTOGRAM_SIZE), torch.nan) if appearance is None else appearance,
+        appearance,
     )
 
 
@@ -235,8 +235,10 @@ def _position_evidence(
 
 
 def _appearance_evidence(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
-    """Evidence of appearance, shape (T, N)."""
-    unknown = torch.full((HISTOGRAM_SIZE,), torch.nan)
+    """Evidence of appearance, shape (T, N); 0 if it is not compared."""
+    if detected.appearance is None:
+        return torch.zeros(len(tracks), len(detected), dtype=torch.float64)
+    unknown = torch.full_like(detected.appearance[0], torch.nan)
     appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
     similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
     elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)

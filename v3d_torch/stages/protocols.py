@@ -123,5 +123,6 @@ class AppearanceStage(Protocol):
             masks: Pixels of N instances, bool, shape :math:`(N, H, W)`.
 
         Returns:
-            Vectors, float32, shape :math:`(N, D)`; NaN for an instance that cannot be described.
+            Vectors of any length D, non-negative with sum 1, float32, shape :math:`(N, D)`; NaN for an instance that
+            cannot be described.
         """
