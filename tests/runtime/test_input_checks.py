@@ -88,6 +88,8 @@ def test_frame_that_is_not_later_is_rejected_without_effect(stamp: float) -> Non
         (replace(INSTANCES, masks=INSTANCES.masks.float()), "masks for frame 7 are torch.float32"),
         (replace(INSTANCES, masks=INSTANCES.masks[:, ::2, ::2]), r"masks for frame 7 are torch.bool of shape \(2, 24"),
         (replace(INSTANCES, labels=torch.tensor([0])), r"labels for frame 7 are torch.int64 of shape \(1,\)"),
+        (replace(INSTANCES, labels=torch.tensor([0, 80])), "labels for frame 7 contain 80, .* the label -1$"),
+        (replace(INSTANCES, labels=torch.tensor([-2, -1])), "labels for frame 7 contain -2, expected COCO classes"),
         (replace(INSTANCES, scores=INSTANCES.scores.double()), "scores for frame 7 are torch.float64"),
         (replace(INSTANCES, boxes=torch.zeros(2, 5)), r"boxes for frame 7 are torch.float32 of shape \(2, 5\)"),
     ],

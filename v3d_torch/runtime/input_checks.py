@@ -91,8 +91,13 @@ def check_order(frame: RGBDFrame, previous_stamp: float) -> None:
         )
 
 
-def check_instances(instances: Instances, frame: RGBDFrame) -> None:
+def check_instances(instances: Instances, frame: RGBDFrame, labels: range) -> None:
     """Check that a segmenter returned valid instances.
+
+    Args:
+        instances: Result of the segmenter.
+        frame: Frame that was segmented.
+        labels: Valid labels: that of things without a class, then the classes.
 
     Raises:
         ConfigError: If the segmenter returned something other than valid instances.
@@ -106,6 +111,12 @@ def check_instances(instances: Instances, frame: RGBDFrame) -> None:
         shape = fill_in(dimensions, sizes)
         if (wrong := describe_wrong_tensor(getattr(instances, name), shape, dtype)) is not None:
             raise ConfigError(f"the segmenter's {name} for frame {frame.index} are {wrong}")
+    unknown = [label for label in instances.labels.tolist() if label not in labels]
+    if unknown:
+        raise ConfigError(
+            f"the segmenter's labels for frame {frame.index} contain {unknown[0]}, expected COCO classes from 0 to"
+            f" {labels[-1]}; give other things that can move the label {labels[0]}"
+        )
 
 
 def fill_in(dimensions: Sequence[int | str], sizes: Mapping[str, int]) -> tuple[int | str, ...]:

@@ -21,6 +21,9 @@ PERSON = COCO_NAMES.index("person")
 UNLABELLED = -1
 """Label of moving objects without a class: the network missed them, or was not trained on their class."""
 
+LABELS = range(UNLABELLED, len(COCO_NAMES))
+"""Labels of instances: `UNLABELLED` and the class indices."""
+
 LIVING = frozenset({PERSON, *range(COCO_NAMES.index("bird"), COCO_NAMES.index("giraffe") + 1)})
 """Class indices of people and animals, which deform by themselves."""
 

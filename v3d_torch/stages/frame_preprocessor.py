@@ -10,6 +10,7 @@ from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.runtime.input_checks import check_frame, check_instances, check_parameters
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation.coco import LABELS
 from v3d_torch.segmentation.segmenter import segment_frame, segmenter_state_of
 from v3d_torch.stages.protocols import DepthStage, FeatureStage
 from v3d_torch.stages.stage_checks import ReplaceableStages
@@ -97,7 +98,7 @@ class FramePreprocessor(ReplaceableStages):
             if is_due:
                 T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
                 instances = segment_frame(self.segment, frame, T_cw)
-                check_instances(instances, frame)
+                check_instances(instances, frame, LABELS)
         return Segmentation(instances, segmenter_state_of(self.segment), timer.times)
 
     def extract_features(self, frame: RGBDFrame) -> Extraction:
