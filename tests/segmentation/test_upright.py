@@ -107,6 +107,14 @@ def test_measured_gravity_gives_the_up_direction_from_the_first_frame_on(start: 
     assert len(network.sizes) == 5
 
 
+def test_frames_with_gravity_are_never_searched() -> None:
+    network = Network(doubtful=0.0)
+    upright, gravity = UprightSegmenter(network), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    for index in range(300):
+        upright.segment_with_pose(replace(make_frame(index, 0), gravity=gravity), IDENTITY)
+    assert len(network.sizes) == 300
+
+
 def test_segmenter_that_loads_a_state_continues_with_the_same_results() -> None:
     first, second = Network(), Network()
     upright, loaded = UprightSegmenter(first), UprightSegmenter(second)

@@ -43,8 +43,8 @@ _GRAVITY_WEIGHT = 2 * _CONFIDENT_WEIGHT
 class UprightSegmenter:
     """Segments images of a rolled camera after rotating them upright by quarter turns.
 
-    A measured gravity gives the up direction. Without one, all four turns are segmented in some of the first calls,
-    until the up direction is settled, and rarely afterwards.
+    A measured gravity gives the up direction, and its frame needs no search. Without one, all four turns are segmented
+    in some of the first calls, until the up direction is settled, and rarely afterwards.
 
     Args:
         segment: Segmenter of frames of any size.
@@ -79,7 +79,7 @@ class UprightSegmenter:
         if frame.gravity is not None:
             self._up = _GRAVITY_WEIGHT * T_cw[:3, :3].T @ -frame.gravity
             self._calls = max(self._calls, _SEARCH_CALLS + 1)
-        is_search = self._is_search_due()
+        is_search = frame.gravity is None and self._is_search_due()
         self._calls += 1
         if not is_search:
             return self._segment_rotated(frame, self._upright_turns(T_cw))
