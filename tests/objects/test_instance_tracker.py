@@ -121,6 +121,17 @@ def test_appearance_of_any_length_can_be_unknown_for_one_instance() -> None:
     assert tracks[0].appearance is None and torch.equal(tracks[1].appearance, torch.eye(16)[0])
 
 
+def test_id_is_kept_over_a_gap_in_time_before_a_frame_in_which_the_object_is_missed() -> None:
+    """After 2 s in which nothing was observed the place is empty; the object is found in the frame after that."""
+    track_boards, colours = BoardTracker(), torch.eye(HISTOGRAM_SIZE)[:1]
+    stamps = [*(frame / 30 for frame in range(6)), 2.2, 2.2 + 1 / 30]
+    boards = [*[Board(-0.4)] * 6, Board(0.1, detected=False), Board(0.1)]
+    for stamp, board in zip(stamps, boards, strict=True):
+        depth, instances = render([board])
+        tracks = track_boards.track(depth, instances, stamp, appearance=colours[: len(instances)])
+    assert [track.id for track in tracks] == [1]
+
+
 def test_class_decides_between_two_equally_distant_instances() -> None:
     """Between two frames a dog and a chair moved by half of their distance."""
     track_boards = BoardTracker(5.0)
@@ -216,6 +227,18 @@ def test_velocity_of_constant_motion_is_estimated() -> None:
         tracks = track_boards(Board(-0.5 + 0.03 * frame, 2.0 + 0.01 * frame))
     expected = torch.tensor([0.9, 0.0, 0.3], dtype=torch.float64)
     assert float((tracks[0].velocity - expected).norm()) < 0.2
+
+
+def test_predicted_cloud_moves_like_the_predicted_state() -> None:
+    """Also after half a second, when the velocity decays."""
+    track_boards = BoardTracker()
+    for frame in range(20):
+        (track,) = track_boards(Board(-0.5 + 0.03 * frame))
+    start = track.predict_state(track.newest.stamp).position
+    for seconds in (0.0, 0.3, 2.0):
+        stamp = track.newest.stamp + seconds
+        motion = (track.predict_cloud(stamp) - track.newest.cloud).mean(dim=0)
+        torch.testing.assert_close(motion, track.predict_state(stamp).position - start)
 
 
 def test_partial_view_changes_the_prediction_less() -> None:

@@ -47,6 +47,9 @@ that the predicted mask is wrong. Tracking leaves out the pixels of all predicte
 _MAX_VACANT_TIME = 0.5
 """A missed object whose place was observed to be empty for longer has gone, seconds."""
 
+_MAX_OBSERVED_TIME = 0.2
+"""Time before a frame for which the frame shows what was there, seconds: what happened in a longer gap is unknown."""
+
 
 class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
@@ -270,7 +273,7 @@ class InstanceTracker(torch.nn.Module):
                 continue
             seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
-                track.add_vacancy(stamp, stamp - self._last_stamp)
+                track.add_vacancy(stamp, min(stamp - self._last_stamp, _MAX_OBSERVED_TIME))
             if track.vacant_time > _MAX_VACANT_TIME:
                 continue
             if stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:

@@ -183,7 +183,7 @@ class Track:
         return moving if moving.stamp == stamp else self._predict_stop(moving, stamp)
 
     def predict_cloud(self, stamp: float) -> Tensor:
-        """Predict the cloud: the newest cloud, moved with constant velocity.
+        """Predict the cloud: the newest cloud, moved like the position in `predict_state`.
 
         Args:
             stamp: Timestamp, seconds.
@@ -191,7 +191,8 @@ class Track:
         Returns:
             Point cloud, world frame, metres, float64, shape :math:`(P, 3)`.
         """
-        return self.newest.cloud.to(torch.float64) + self.velocity * (stamp - self.newest.stamp)
+        motion = self.predict_state(stamp).position - self.predict_state(self.newest.stamp).position
+        return self.newest.cloud.to(torch.float64) + motion.nan_to_num(0.0)  # NaN before the first centroid
 
     def predict_return(self, stamp: float) -> ObjectState:
         """Predict the state of an object that is not observed any more, see `ObjectState.predict_with_decay`.
@@ -230,7 +231,7 @@ class Track:
 
         Args:
             stamp: Timestamp of the observation, seconds.
-            seconds: Time since the observation before.
+            seconds: Time for which it was observed.
         """
         self.vacant_time += seconds
         evidence = vacancy_log_ratio(self.vacant_time, self._filter.state.motion_variance(stamp - self.newest.stamp))
