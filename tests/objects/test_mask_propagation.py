@@ -45,11 +45,11 @@ def intersection_over_union(a: Tensor, b: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("rate", [10.0, 30.0])
-def test_masks_follow_a_moving_and_a_standing_object(rate: float) -> None:
+def test_masks_follow_a_moving_and_a_standing_object_and_furniture(rate: float) -> None:
     track_boards = walk(rate)
-    found, truth = propagate(track_boards, [Board(-0.6 + SPEED * 6 / rate), STANDING])
-    assert found.labels.tolist() == [PERSON, PERSON]  # not the furniture
-    assert found.scores.tolist() == [0.0, 0.0] and found.boxes.shape == (2, 4)
+    found, truth = propagate(track_boards, [Board(-0.6 + SPEED * 6 / rate), STANDING, FURNITURE])
+    assert found.labels.tolist() == [PERSON, PERSON, CHAIR]
+    assert found.scores.tolist() == [0.0] * 3 and found.boxes.shape == (3, 4)
     assert float(intersection_over_union(found.masks, truth.masks).min()) > 0.85
 
 
@@ -105,6 +105,16 @@ def test_wrong_first_class_is_corrected_with_frames_without_segmentation() -> No
         depth, instances = render([Board(-0.4 + 0.02 * frame, label=DOG if frame == 0 else PERSON)])
         result = stage(frame / 30, instances if frame % 2 == 0 else None, depth, HERE)
         assert [(obj.id, obj.label) for obj in result.objects] == [(1, PERSON if frame >= 4 else DOG)]
+
+
+def test_furniture_votes_in_frames_with_and_without_segmentation() -> None:
+    stage = ObjectStage(ObjectsConfig(clouds=CLOUDS), CAMERA)
+    for frame in range(8):
+        boards = [Board(-0.4 + 0.1 * frame), Board(-1.3, z=3.0, label=CHAIR), Board(1.3, z=3.0, label=CHAIR)]
+        depth, instances = render(boards)
+        result = stage(frame / 10, instances if frame % 2 == 0 else None, depth, HERE)
+        assert [(obj.id, obj.label) for obj in result.objects] == [(1, PERSON), (2, CHAIR), (3, CHAIR)]
+        assert result.vote_pairs == ([(2, 1), (3, 1)] if frame > 0 else [])
 
 
 def test_no_tracks_give_no_instances() -> None:

@@ -29,10 +29,9 @@ _DEPTH_TOLERANCE = 0.2
 def propagate_instances(
     tracks: Sequence[Track], view: DepthView, camera: PinholeCamera, config: CloudConfig
 ) -> Instances:
-    """Compute the masks of detected objects that may move from the depth of the current frame.
+    """Compute the masks of detected objects from the depth of the current frame.
 
-    Unlabelled objects are left out, because they are detected in the depth of every frame. Furniture is left out,
-    because tracking uses its pixels.
+    Unlabelled objects are left out, because they are detected in the depth of every frame.
 
     Args:
         tracks: Tracks after the previous frame.
@@ -43,7 +42,7 @@ def propagate_instances(
     Returns:
         Instances with the classes of the tracks, score 0 and empty boxes.
     """
-    detected = [track for track in tracks if track.may_move and not track.missed and track.label != UNLABELLED]
+    detected = [track for track in tracks if not track.missed and track.label != UNLABELLED]
     R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
     clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in detected]
     projected = silhouettes(clouds, camera, config.voxel_size)
