@@ -27,6 +27,7 @@ from helpers.module_cases import (
     without_padding,
 )
 from torch import Tensor
+from torch.autograd import forward_ad
 
 import v3d_torch as v3d
 from v3d_torch.objects.instance_clouds import InstanceClouds
@@ -255,6 +256,37 @@ def test_padding_has_no_gradient(case: Case) -> None:
         assert argument.grad is not None and argument.grad.isfinite().all() and argument.grad.any()
         if name in case.masks:
             assert not argument.grad[~inputs[case.masks[name]]].any()
+
+
+DIFFERENTIABLE = {name: case for name, case in (CASES | FUNCTION_CASES).items() if case.differentiable}
+
+IMPLICIT = {"EssentialRANSAC", "PnPRANSAC", "PoseRefiner", "BundleAdjuster", "PoseGraphOptimiser"}
+"""Solvers that compute Jacobians in forward mode; torch cannot nest these in its dual levels, only in `torch.func`."""
+
+
+@pytest.mark.parametrize(
+    ("title", "name"), [(title, name) for title, case in DIFFERENTIABLE.items() for name in case.differentiable]
+)
+def test_tangent_of_forward_mode_differentiation_equals_jvp(title: str, name: str) -> None:
+    case = DIFFERENTIABLE[title]
+    inputs = case.inputs(2, 12, torch.float64)
+    direction = random(*inputs[name].shape, dtype=torch.float64, seed=3) - 0.5
+
+    def function(argument: Tensor) -> tuple[Tensor, ...]:
+        return tensors(case.function(**inputs | {name: argument}))
+
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(inputs[name], direction)
+        if title in IMPLICIT:
+            with pytest.raises(RuntimeError, match="Nested forward mode AD is not supported"):
+                function(dual)
+            return
+        found = [forward_ad.unpack_dual(result).tangent for result in function(dual)]
+    values, expected = torch.func.jvp(function, (inputs[name],), (direction,))
+    for value, one, other in zip(values, found, expected, strict=True):
+        assert other[value.isfinite()].isfinite().all()
+        torch.testing.assert_close(torch.zeros_like(other) if one is None else one, other, equal_nan=True)
+    assert any(other.any() for other in expected)
 
 
 def test_smoothing_has_no_gradient_at_missing_depth() -> None:

@@ -76,7 +76,9 @@ def test_kernel_runs_for_plain_tensors_only(double: list[str]) -> None:
     doubled(torch.ones(1))  # another dtype
     doubled(torch.ones(1, dtype=torch.float64, requires_grad=True))
     doubled(torch.ones(1, dtype=torch.float64, device="meta"))
-    assert double == ["kernel", "torch", "torch", "torch"]
+    with torch.autograd.forward_ad.dual_level():
+        doubled(torch.ones(1, dtype=torch.float64))
+    assert double == ["kernel", "torch", "torch", "torch", "torch"]
     assert doubled.__doc__ == "Twice a number."
 
 

@@ -39,3 +39,5 @@ def test_gradients_are_needed_for_inputs_with_gradients_and_inside_transforms() 
     seen = []
     grad(lambda y: (seen.append(needs_gradient(y)), y.sum())[1])(x)
     assert seen == [True]
+    with torch.autograd.forward_ad.dual_level():
+        assert needs_gradient(x)

@@ -86,12 +86,10 @@ def nearest_rotation(M: Tensor) -> Tensor:
 
     The gradient is computed from the maximum, so that it is finite even where singular vectors have no gradient.
     """
-    with torch.no_grad():
-        finite, is_unknown = zero_if_not_finite(M)
-        U, _, Vh = torch.linalg.svd(finite)
-        signs = torch.stack([*torch.ones_like(M[..., :2, 0]).unbind(-1), torch.linalg.det(U @ Vh).sign()], dim=-1)
-        R = (U * signs[..., None, :]) @ Vh  # the last sign excludes reflections
-        R = torch.where(is_unknown, torch.nan, R)
+    finite, is_unknown = zero_if_not_finite(M.detach())
+    U, _, Vh = torch.linalg.svd(finite)
+    signs = torch.stack([*torch.ones_like(finite[..., :2, 0]).unbind(-1), torch.linalg.det(U @ Vh).sign()], dim=-1)
+    R = torch.where(is_unknown, torch.nan, (U * signs[..., None, :]) @ Vh)  # the last sign excludes reflections
     if not needs_gradient(M):
         return R
     # Gradient and negated Hessian of trace(exp(phi)^T A) by phi, with A = M R^T.

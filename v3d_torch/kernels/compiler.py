@@ -184,7 +184,7 @@ def can_read(tensor: Tensor) -> bool:
     """Check whether the values of a tensor can be read at once.
 
     Values on another device require waiting for the device. Meta tensors, and tensors that `torch.func` transforms or a
-    compiler traces, have no values.
+    compiler traces, have no values; those in forward-mode differentiation count as such.
     """
     is_plain = type(tensor) in (Tensor, torch.nn.Parameter)
     return not _is_traced() and is_plain and tensor.device.type == "cpu"
@@ -195,9 +195,20 @@ def is_all_true(mask: Tensor) -> bool:
     return can_read(mask) and bool(mask.all())
 
 
+def is_transformed() -> bool:
+    """Check whether `torch.func` or forward-mode differentiation transforms the computation; False in a compiler.
+
+    A tensor with a tangent of forward-mode differentiation needs no gradient (``requires_grad`` is false), but compiled
+    code would lose its tangent.
+    """
+    if torch.compiler.is_compiling():
+        return False
+    return torch._C._are_functorch_transforms_active() or torch.autograd.forward_ad._current_level >= 0
+
+
 def _is_traced() -> bool:
-    """Check whether `torch.func` or a compiler traces the computation."""
-    return torch.compiler.is_compiling() or torch._C._are_functorch_transforms_active()
+    """Check whether a compiler traces the computation, or a transform does."""
+    return torch.compiler.is_compiling() or is_transformed()
 
 
 def _is_plain(argument: object) -> bool:

@@ -22,10 +22,12 @@ import torch
 from torch import Tensor
 from torch.func import jvp, vmap
 
+from v3d_torch.kernels.compiler import is_transformed
+
 
 def needs_gradient(*tensors: Tensor) -> bool:
     """Check whether derivatives with respect to any of the tensors are tracked."""
-    if not torch.compiler.is_compiling() and torch._C._are_functorch_transforms_active():
+    if is_transformed():
         return True
     return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
 
