@@ -84,6 +84,19 @@ def test_import_loads_no_heavy_library(modules: str, heavy: str) -> None:
     assert done.stdout.strip() == "set()"
 
 
+def test_package_that_is_first_used_in_inference_mode_can_be_trained() -> None:
+    code = """
+import torch, v3d_torch as v3d
+with torch.inference_mode():
+    v3d.se3_exp(torch.zeros(6))
+uv = (100 * torch.rand(20, 2)).requires_grad_()
+v3d.se3_log(v3d.refine_pose(torch.eye(4), torch.rand(20, 3) + 1, uv, torch.eye(3)).T_cw).sum().backward()
+print(uv.grad is not None)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)  # noqa: S603
+    assert done.stdout.strip() == "True", done.stderr
+
+
 @pytest.fixture(scope="module")
 def imports() -> dict[str, set[str]]:
     """Modules of the package that each of its modules imports at module level."""
