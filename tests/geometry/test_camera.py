@@ -88,6 +88,22 @@ def test_back_projection_gradcheck() -> None:
     assert torch.autograd.gradcheck(BackProjector(camera), (depth,))
 
 
+@pytest.mark.parametrize("camera", [FR1, FR3], ids=["distorted", "undistorted"])
+def test_camera_that_is_first_used_in_inference_mode_has_gradients(camera: PinholeCamera) -> None:
+    camera = replace(camera)  # without cached tensors
+    with torch.inference_mode():
+        camera.project_to_image(torch.ones(1, 3, dtype=torch.float64), 0.1)
+        camera.normalise(camera.K[:2, :2])
+    depth = torch.ones(1, 1, camera.height, camera.width, requires_grad=True)
+    BackProjector(camera)(depth).sum().backward()
+    assert depth.grad is not None
+    points = torch.rand(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    uv, inside = camera.project_to_image(points + 1, 0.1)
+    (uv[inside].sum() + camera.normalise(camera.distort(points[:, :2] * 100)).sum()).backward()
+    assert points.grad is not None
+    assert not any(value.is_inference() for value in vars(camera).values() if isinstance(value, torch.Tensor))
+
+
 def test_camera_accepts_numpy_and_torch_numbers() -> None:
     K = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
     distortion = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera returns it

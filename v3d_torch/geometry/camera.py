@@ -123,21 +123,25 @@ class PinholeCamera:
         return self._K.clone()
 
     @cached_property
+    @torch.inference_mode(False)  # like all cached tensors, it can later be used where gradients are required
     def _K(self) -> Tensor:
         """Camera matrix, float64, shape (3, 3)."""
         return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     @cached_property
+    @torch.inference_mode(False)
     def focal_lengths(self) -> Tensor:
         """Focal lengths along u and v, pixels, float64, shape :math:`(2,)`."""
         return torch.tensor([self.fx, self.fy], dtype=torch.float64)
 
     @cached_property
+    @torch.inference_mode(False)
     def _principal_point(self) -> Tensor:
         """Principal point (u, v), pixels, float64, shape (2,)."""
         return torch.tensor([self.cx, self.cy], dtype=torch.float64)
 
     @cached_property
+    @torch.inference_mode(False)
     def _size(self) -> Tensor:
         """Width and height, pixels, float64, shape (2,)."""
         return torch.tensor([self.width, self.height], dtype=torch.float64)
@@ -233,6 +237,7 @@ class PinholeCamera:
         return torch.stack([u, v], dim=-1)
 
     @cached_property
+    @torch.inference_mode(False)
     def _normalised_bounds(self) -> Tensor:
         """Minimum and maximum (x / z, y / z) of the image, with a margin of one pixel, shape (2, 2)."""
         extremes = self.rays[..., :2].flatten(0, 1).to(torch.float64).aminmax(dim=0)
@@ -286,6 +291,7 @@ class PinholeCamera:
         return torch.stack([x * depth, y * depth, depth], dim=-1)
 
     @cached_property
+    @torch.inference_mode(False)
     def rays(self) -> Tensor:
         """Viewing ray of every pixel of the recorded image at unit depth, float32, shape :math:`(H, W, 3)`."""
         v, u = torch.meshgrid(
