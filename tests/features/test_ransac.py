@@ -163,6 +163,19 @@ def test_prediction_that_is_not_finite_counts_as_none() -> None:
     assert not pnp_ransac(**few, initial_guess=guess).found
 
 
+def test_prediction_that_is_not_finite_does_not_change_the_gradients() -> None:
+    inputs = camera_inputs.points_in_view(2, 30, torch.float64)
+    inputs["valid"] = torch.ones(2, 30, dtype=torch.bool)
+    points = inputs.pop("points").requires_grad_()
+    expected = pnp_ransac(points, **inputs)
+    guess = torch.stack([expected.T_cw[0].detach(), torch.full((4, 4), torch.nan, dtype=torch.float64)])
+    found = pnp_ransac(points, **inputs, initial_guess=guess)
+    assert expected.found.all()
+    by_guess, without_guess = (torch.autograd.grad(each.T_cw.sum(), points)[0] for each in (found, expected))
+    assert without_guess.any()
+    torch.testing.assert_close(by_guess, without_guess, rtol=1e-3, atol=1e-6)
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 5])
 def test_too_few_points_of_a_mapped_batch_give_no_pose(count: int) -> None:
     inputs = camera_inputs.points_in_view(2, count, torch.float64)

@@ -125,7 +125,10 @@ def pnp_ransac(
         """Poses, a mask of the problems with a pose, and a mask of the points that refine it, (..., N)."""
         if initial_guess is not None:
             predicted = initial_guess.detach().expand(*batch, 4, 4)
-            yield predicted, predicted.isfinite().all(dim=-1).all(dim=-1), mask
+            exists = predicted.isfinite().all(dim=-1).all(dim=-1)
+            # The result of another pose is not used, but NaN would reach the gradients.
+            identity = torch.eye(4, dtype=predicted.dtype, device=predicted.device)
+            yield torch.where(exists[..., None, None], predicted, identity), exists, mask
         if can_read(data[1]):
             best, exists = _sample_opencv(*data, mask & ~done[..., None], *settings)
         else:
