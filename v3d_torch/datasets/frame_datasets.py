@@ -74,7 +74,10 @@ class SequenceDataset(Dataset[Sample], ABC):
                 f"{sequence.name}: has no frames for a sample among its {len(sequence)} frames, of which"
                 f" {int(has_pose.sum())} have a true pose; use fewer frames, or a smaller interval between them"
             )
-        self._has_masks = isinstance(sequence, HasMotionMasks) and sequence.motion_mask(self.indices[0]) is not None
+        frames = sorted({first + offset for first in self.indices for offset in offsets})
+        self._has_masks = isinstance(sequence, HasMotionMasks) and any(
+            sequence.motion_mask(frame) is not None for frame in frames
+        )
 
     def __len__(self) -> int:
         """Return the number of samples."""
