@@ -34,7 +34,7 @@ A number refers to a reason below the table; `-` means that the result has no gr
 
 TAIL = """
 Half precision is computed in float32 or float64; costs, chi-square values and information, which can exceed its range,
-are returned in float32.
+are returned in float32. Inside `torch.autocast`, the results are the same as outside.
 
 Under `compile`, `export` and `vmap`, and on other devices, the torch functions run instead of compiled kernels and
 libraries for the CPU. Three of them then differ: `voxel_pool` returns as many voxels as points, with a mask;

@@ -140,6 +140,15 @@ def test_module_can_be_copied_and_pickled(case: Case) -> None:
     assert not list(case.module.parameters())  # settings are numbers unless a parameter is given
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("case", (CASES | FUNCTION_CASES).values(), ids=CASES | FUNCTION_CASES)
+def test_results_inside_autocast_equal_those_outside(case: Case, dtype: torch.dtype) -> None:
+    inputs = case.inputs(2, 12, torch.float32)
+    expected = case.function(**inputs)
+    with torch.autocast("cpu", dtype):
+        assert_same(case.function(**inputs), expected)
+
+
 each_of_the_camera = pytest.mark.parametrize("case", CAMERA_CASES.values(), ids=CAMERA_CASES)
 
 

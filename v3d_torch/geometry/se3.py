@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import without_autocast, working_dtype
 from v3d_torch.kernels import se3 as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.kernels.reprojection import SMALL_ANGLE
@@ -103,6 +103,7 @@ def _se3_exp_compiled(xi: Tensor) -> Tensor:
 
 
 @compiled_by(_se3_exp_compiled)
+@without_autocast
 def se3_exp(xi: Tensor) -> Tensor:
     r"""Exponential map of SE(3): the matrix exponential of :math:`\hat\xi`, in closed form.
 
@@ -134,6 +135,7 @@ def _se3_log_compiled(T: Tensor) -> Tensor:
 
 
 @compiled_by(_se3_log_compiled)
+@without_autocast
 def se3_log(T: Tensor) -> Tensor:
     """Logarithm of SE(3), the inverse of `se3_exp`.
 

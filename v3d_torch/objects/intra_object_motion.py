@@ -8,7 +8,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import without_autocast, working_dtype
 from v3d_torch.objects.chamfer import chamfer_distance
 
 
@@ -26,6 +26,7 @@ class Deformation(NamedTuple):
     deforming: Tensor
 
 
+@without_autocast
 def intra_object_motion(
     previous: Tensor,
     current: Tensor,

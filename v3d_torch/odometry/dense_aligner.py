@@ -17,6 +17,7 @@ from torch import Tensor
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
@@ -142,6 +143,7 @@ class DenseAligner(torch.nn.Module):
         return DenseView(grey, depth, static, self._cameras, self._config)
 
     @torch.no_grad()
+    @without_autocast
     def forward(
         self,
         grey_a: Tensor,
