@@ -12,7 +12,12 @@ from helpers.rolling_camera import AT_REST, CAMERA, KINECT, VELOCITY, features_o
 from torch import Tensor
 
 from v3d_torch.config import Config
-from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, compensate_features
+from v3d_torch.odometry.rolling_shutter import (
+    GLOBAL_SHUTTER,
+    Readout,
+    compensate_features,
+    compensate_rolling_shutter,
+)
 
 
 def max_error(velocity: Tensor, readout: Readout) -> float:
@@ -57,6 +62,16 @@ def test_compensation_with_another_velocity_replaces_the_first() -> None:
 def test_features_are_unchanged_at_rest_or_with_a_global_shutter(velocity: Tensor, readout: Readout) -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
     assert torch.equal(compensate_features(observed, velocity, readout, CAMERA).uv, observed.uv)
+
+
+def test_only_the_readout_can_have_batch_dimensions() -> None:
+    observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)
+    given = observed.uv, observed.pixel[:, 1], observed.inverse_depth, VELOCITY
+    readouts = torch.tensor([KINECT.seconds, 0.0], dtype=torch.float64)
+    found = compensate_rolling_shutter(*given, readouts, CAMERA.K, CAMERA.height)
+    alone = [compensate_rolling_shutter(*given, each, CAMERA.K, CAMERA.height) for each in readouts]
+    for one, other in zip(found, zip(*alone, strict=True), strict=True):
+        torch.testing.assert_close(one, torch.stack(other))
 
 
 def test_compensation_of_no_features_is_empty() -> None:

@@ -172,6 +172,8 @@ def compensate_rolling_shutter(
     pixel_velocity, _ = motion_field(observed, inverse_depth, velocity.to(torch.float64), K.to(torch.float64))
     jacobian = -(row / (height - 1) - 0.5)[..., None] * pixel_velocity  # rows from -0.5 to 0.5
     compensated = observed + seconds * jacobian
+    # The readout can be the only input with batch dimensions.
+    jacobian = jacobian.expand_as(compensated).contiguous()
     dtype = result_dtype(uv.dtype)
     return fill_padding(compensated, each, 0.0).to(dtype), fill_padding(jacobian, each, 0.0).to(dtype)
 
