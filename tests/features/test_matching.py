@@ -6,6 +6,7 @@ import cv2
 import kornia_rs
 import pytest
 import torch
+from helpers import camera_inputs
 from helpers.random_descriptors import invert_bits, random_descriptors
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -59,6 +60,20 @@ def test_too_few_descriptors_have_no_matches() -> None:
     for count in ((1, 5), (5, 1)):
         a, b = map(random_descriptors, count, (0, 0))
         assert match_descriptors(a, b, max_hamming=64, max_ratio=1.0).tolist() == [-1] * count[0]
+
+
+@pytest.mark.parametrize("count", [0, 30])
+@pytest.mark.parametrize("name", ["a", "b", "a_valid", "b_valid"])
+def test_any_input_can_have_batch_dimensions(name: str, count: int) -> None:
+    """Both implementations, and inputs of which others have fewer batch dimensions."""
+    inputs = camera_inputs.descriptors(3, count, torch.float64)
+    several = {key: each if key == name else each[0] for key, each in inputs.items()}
+    expected = [match_descriptors(**several | {name: each}) for each in inputs[name]]
+    twin = TWINS["v3d_torch.features.matching.match_descriptors"]
+    for match in twin if ENABLED else (twin.torch,):
+        assert torch.equal(match(**several), torch.stack(expected))
+        nested = match(**several | {"a_valid": several["a_valid"].expand(2, 3, count)})
+        assert torch.equal(nested, torch.stack(expected).expand(2, 3, count))
 
 
 @settings(deadline=None, max_examples=30)

@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.config import OdometryConfig
 from v3d_torch.kernels import descriptors as descriptor_kernels
 from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.runtime.batches import common_batch
 
 MAX_HAMMING, MAX_RATIO = OdometryConfig().max_hamming, OdometryConfig().max_ratio
 """Default thresholds, those of the odometry section of the configuration."""
@@ -53,10 +54,11 @@ def _match_descriptors_compiled(
 ) -> Tensor:
     if any(each.dtype != torch.uint8 or each.ndim < 2 or each.shape[-1] != _BYTES for each in (a, b)):
         return NotImplemented
-    if a.shape[:-2] != b.shape[:-2]:
-        return NotImplemented
+    masks = [valid for valid in (a_valid, b_valid) if valid is not None]
+    batch = common_batch(*(each.shape[:-2] for each in (a, b)), *(valid.shape[:-1] for valid in masks))
+    a, b = (each.expand(*batch, *each.shape[-2:]) for each in (a, b))
     matches = torch.full(a.shape[:-1], -1)
-    for index in np.ndindex(a.shape[:-2]):
+    for index in np.ndindex(batch):
         rows, columns = (
             None if valid is None else valid.expand(each.shape[:-1])[index].nonzero()[:, 0]
             for each, valid in ((a, a_valid), (b, b_valid))
@@ -103,13 +105,13 @@ def match_descriptors(
     KORNIA_CHECK_SHAPE(a, ["*", "N", "D"])
     KORNIA_CHECK_SHAPE(b, ["*", "M", str(a.shape[-1])])
     distance = _pairwise_hamming_distances(a, b)
-    if 0 in distance.shape[-2:]:
-        return distance.new_full(distance.shape[:-1], -1, dtype=torch.int64)
     a_valid = distance.new_ones(a.shape[-2], dtype=torch.bool) if a_valid is None else a_valid
     b_valid = distance.new_ones(b.shape[-2], dtype=torch.bool) if b_valid is None else b_valid
     enough = (a_valid.sum(dim=-1) >= 2) & (b_valid.sum(dim=-1) >= 2)
     never = 8 * a.shape[-1] + 1  # exceeds all distances
     distance = torch.where(a_valid[..., :, None] & b_valid[..., None, :], distance, never)
+    if 0 in distance.shape[-2:]:
+        return distance.new_full(distance.shape[:-1], -1, dtype=torch.int64)
     best, nearest = distance.min(dim=-1)
     second = distance.scatter(-1, nearest[..., None], never).amin(dim=-1)
     row = torch.arange(a.shape[-2], device=a.device)
