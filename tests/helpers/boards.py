@@ -73,7 +73,7 @@ class BoardTracker:
     def __init__(self, rate: float = 30.0, **config: float | bool) -> None:
         self.rate = rate
         self.frame = -1
-        self.tracker = InstanceTracker(TrackerConfig(**config), CAMERA, CLOUDS.voxel_size)
+        self.tracker = InstanceTracker(TrackerConfig(**config), CAMERA, CLOUDS)
         self._back_project = InstanceBackProjector(CLOUDS, CAMERA)
 
     def __call__(self, *boards: Board, T_wc: Tensor = HERE, stamp: float | None = None) -> list[Track]:

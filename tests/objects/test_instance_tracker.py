@@ -521,6 +521,17 @@ def test_missed_object_without_centroid_keeps_id_and_mask() -> None:
         assert torch.equal(track.mask, instances.masks[0])
 
 
+def test_missed_object_without_centroid_has_no_pixels_where_something_else_is_measured() -> None:
+    """A curtain at 1.5 m then hides half of the object."""
+    track_boards, nothing = BoardTracker(), Instances.empty(CAMERA.height, CAMERA.width)
+    depth, instances = render([Board(0.0)])
+    depth[:, instances.masks[0]] = 7.0
+    track_boards.track(depth, instances, 0.0)
+    depth[:, :, 80:] = 1.5
+    (track,) = track_boards.track(depth, nothing, 1 / 30)
+    assert bool(track.mask[:, :80].any()) and not track.mask[:, 80:].any()
+
+
 def test_missing_centroid_in_one_frame_keeps_id_and_velocity() -> None:
     track_boards = BoardTracker()
     for frame in range(12):

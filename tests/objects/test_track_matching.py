@@ -25,7 +25,7 @@ def evidence(before: list[Board], after: list[Board], appearance: torch.Tensor |
     depth, instances = render(after)
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
     detected = detect_instances(0.1, instances, clouds, appearance, HERE, 1)
-    predicted = predict_tracks(tracks, 0.1, depth, HERE, CAMERA, CLOUDS.voxel_size, 1)
+    predicted = predict_tracks(tracks, 0.1, depth, HERE, CAMERA, CLOUDS, 1)
     return compare_tracks(predicted, detected, TrackerConfig())
 
 

@@ -8,15 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from v3d_torch.config import TrackerConfig
+from v3d_torch.config import CloudConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
 from v3d_torch.objects.track import STAMP_TOLERANCE, Track
 from v3d_torch.objects.track_matching import (
-    DEPTH_TOLERANCE,
     DetectedInstances,
     PredictedTracks,
     compare_tracks,
@@ -64,7 +64,7 @@ class InstanceTracker(torch.nn.Module):
     Args:
         config: Gates and times.
         camera: Camera of all frames.
-        voxel_size: Spacing of the points of the clouds, metres.
+        clouds: Spacing and maximum depth of the points of the clouds.
 
     Attributes:
         tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
@@ -74,11 +74,11 @@ class InstanceTracker(torch.nn.Module):
             motion of the camera was not measured.
     """
 
-    def __init__(self, config: TrackerConfig, camera: PinholeCamera, voxel_size: float) -> None:
+    def __init__(self, config: TrackerConfig, camera: PinholeCamera, clouds: CloudConfig) -> None:
         super().__init__()
         self._config = config
         self._camera = camera
-        self._voxel_size = voxel_size
+        self._clouds = clouds
         self._stride = max(1, camera.width // _COARSE_COLUMNS)
         self._next_id = 1
         self._last_stamp = -torch.inf
@@ -136,7 +136,7 @@ class InstanceTracker(torch.nn.Module):
         camera, stride = self._camera, self._stride
         compared = appearance if self._config.compare_appearance else None
         detected = detect_instances(stamp, instances, clouds, compared, T_wc, stride)
-        predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._voxel_size, stride)
+        predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._clouds, stride)
         matches = self._match(predicted, detected)
 
         # Update matched tracks, and start a track for each instance without a match, unless it shows a matched object.
@@ -279,11 +279,8 @@ class InstanceTracker(torch.nn.Module):
             if stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:
                 lost.append(track)
                 continue
-            if track.newest.has_centroid:
-                mask = predicted.silhouettes[i].mask(depth, 0, DEPTH_TOLERANCE, include_missing=True)
-                track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
-            else:  # without points to project, the last masks are the best prediction
-                track.missed = True
+            mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)
+            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
             is_recent = stamp - track.newest.stamp <= _MAX_VISIBLE_TIME + STAMP_TOLERANCE
             track.visible = bool(predicted.visible[i]) and track.is_confirmed and is_recent
             missed.append(track)

@@ -4,7 +4,7 @@ Segmentation of every second frame halves the largest cost of a frame. In the fr
 predicts its points, and the depth image gives its outline: the pixels near the predicted points that have the depth of
 these points. Objects of propagated masks are measured like objects of network masks, so that centroids, votes and
 Chamfer distances come from the depth of the frame and not from a prediction. An object without a centroid, for example
-because it is too far for its depth, has no points to project: it keeps its last mask, where nothing else is measured.
+because it is too far for its depth, has no points to project, or few: it keeps its last mask where nothing is measured.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from v3d_torch.objects.track import Track
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
-_DEPTH_TOLERANCE = 0.2
+DEPTH_TOLERANCE = 0.2
 """Tolerance of the depth around the predicted points, metres: arms and legs swing by this much between two frames."""
 
 
@@ -50,7 +50,7 @@ def propagate_instances(
         track: mask
         for track, each in zip(detected, projected, strict=True)
         # An object without a pixel has left the view or is hidden: it is missed.
-        if (mask := _predict_mask(track, each, view.depth, config.max_depth)).numpy().any()
+        if (mask := predict_mask(track, each, view.depth, config.max_depth)).numpy().any()
     }
     if not masks:
         return Instances.empty(*view.depth.shape[-2:])
@@ -58,10 +58,24 @@ def propagate_instances(
     return Instances(torch.stack([*masks.values()]), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
 
 
-def _predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float) -> Tensor:
-    """Return the pixels near the predicted points that have their depth; without a centroid see the module."""
-    if not track.newest.has_centroid:
-        # The depth of what is beside or in front of the object would become its centroid.
-        has_points = (depth[0] > 0) & (depth[0] <= max_depth)
-        return track.mask & ~has_points
-    return silhouette.mask(depth, 0, _DEPTH_TOLERANCE, include_missing=True)
+def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float, *, step: int = 1) -> Tensor:
+    """Return the pixels near the predicted points that have their depth.
+
+    Without a centroid, the pixels of the last mask at which no points are measured belong to the object as well. The
+    others do not: the depth of what is beside or in front of the object would become its centroid.
+
+    Args:
+        track: Track of the object.
+        silhouette: Projection of its predicted cloud.
+        depth: Depth of every n-th pixel, metres, shape :math:`(1, h, w)`; 0 = no measurement.
+        max_depth: Maximum depth of points, metres.
+        step: Step n between the pixels of ``depth``.
+
+    Returns:
+        Mask of every n-th pixel, bool, shape :math:`(h, w)`.
+    """
+    mask = silhouette.mask(depth, 0, DEPTH_TOLERANCE, step=step, include_missing=True)
+    if track.newest.has_centroid:
+        return mask
+    has_points = (depth[0] > 0) & (depth[0] <= max_depth)
+    return mask | (track.mask[::step, ::step] & ~has_points)

@@ -79,7 +79,9 @@ class MaskRefiner:
         """Return the refined mask of one of the objects, bool, shape :math:`(H, W)`."""
         config, depth = self._config, self._view.depth
         if track not in self._silhouettes:  # too few points for a depth range of the object
-            return dilate(track.mask, config.depth_margin)
+            # A predicted mask already agrees with the depth; without points it is the last one.
+            is_predicted = track.missed and len(track.newest.cloud) > 0
+            return track.mask if is_predicted else dilate(track.mask, config.depth_margin)
         silhouette, median_depth = self._silhouettes[track]
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
         # NumPy combines masks faster here than torch.

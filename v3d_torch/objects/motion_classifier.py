@@ -55,7 +55,7 @@ class MotionClassifier:
         self._config = config
         self._camera = camera
         self._last_stamp = -torch.inf
-        self.tracker = InstanceTracker(config.tracker, camera, config.clouds.voxel_size)
+        self.tracker = InstanceTracker(config.tracker, camera, config.clouds)
 
     def __call__(
         self,

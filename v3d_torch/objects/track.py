@@ -93,8 +93,7 @@ class Track:
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
-        missed: True if the object was not detected in the newest frame, so that its masks are predicted; without a
-            centroid they are the last ones.
+        missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         visible: True if the object was detected in the newest frame, or is confirmed, was missed for a short time only,
             and the depth shows it at its predicted position.
         is_confirmed: True if scores or motion have shown that the object exists.

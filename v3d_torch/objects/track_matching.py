@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.config import TrackerConfig
+from v3d_torch.config import CloudConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.objects.appearance import histogram_similarity
@@ -20,6 +20,7 @@ from v3d_torch.objects.association import (
     score_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Detection3D, Track
@@ -34,9 +35,6 @@ area."""
 
 _MIN_COVERAGE = 0.5
 """An instance covers a predicted mask if their intersection is at least this fraction of the smaller area."""
-
-DEPTH_TOLERANCE = 0.2
-"""Tolerance of the depth of a predicted object, metres: arms and legs swing by this much."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +68,7 @@ class PredictedTracks:
     Attributes:
         tracks: T tracks.
         silhouettes: Projection of the newest cloud of each track at its predicted position.
-        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`; the last mask of a track without a centroid,
-            which has no points to predict.
+        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`.
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
             :math:`(T,)`.
     """
@@ -126,7 +123,7 @@ def predict_tracks(
     depth: Tensor,
     T_cw: Tensor,
     camera: PinholeCamera,
-    spacing: float,
+    config: CloudConfig,
     stride: int,
 ) -> PredictedTracks:
     """Predict tracks, and check whether they are visible at their predicted positions.
@@ -137,21 +134,20 @@ def predict_tracks(
         depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         camera: Camera of the frame.
-        spacing: Spacing of the points of the clouds, metres.
+        config: Spacing and maximum depth of the points of the clouds.
         stride: Step between the coarse pixels, pixels.
     """
     clouds = [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in tracks]
-    projected = silhouettes(clouds, camera, spacing)
+    projected = silhouettes(clouds, camera, config.voxel_size)
     coarse_depth = depth[:, ::stride, ::stride].contiguous()
-    masks = [each.mask(coarse_depth, 0, DEPTH_TOLERANCE, step=stride, include_missing=True) for each in projected]
-    packed = pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool))
-    for i, track in enumerate(tracks):
-        if not track.newest.has_centroid:
-            packed[i] = track.coarse_mask
+    masks = [
+        predict_mask(track, each, coarse_depth, config.max_depth, step=stride)
+        for track, each in zip(tracks, projected, strict=True)
+    ]
     return PredictedTracks(
         tuple(tracks),
         projected,
-        packed,
+        pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
         torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
     )
 
