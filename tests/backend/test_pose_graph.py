@@ -142,7 +142,7 @@ def consistent_graphs(draw: st.DrawFn) -> tuple[Tensor, Tensor]:
     return T_wc, torch.tensor(flipped)
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(consistent_graphs(), st.integers(0, 100))
 def test_consistent_measurements_are_fitted_exactly(graph: tuple[Tensor, Tensor], seed: int) -> None:
     T_wc, edges = graph
@@ -155,7 +155,7 @@ def test_consistent_measurements_are_fitted_exactly(graph: tuple[Tensor, Tensor]
     assert result.cost_after <= result.cost_before
 
 
-@settings(deadline=None, max_examples=10)
+@settings(max_examples=10)
 @given(st.lists(st.floats(-1.5, 1.5), min_size=6, max_size=6))
 def test_solution_moves_with_the_world_frame(numbers: list[float]) -> None:
     graph = Graph(20, 5)
@@ -230,7 +230,7 @@ def test_kernel_equals_its_twin(poses: int, loops: int, fixed: list[int], monkey
 # ---------------------------------------------------------------- batches, padding
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.lists(st.booleans(), min_size=15, max_size=15))
 def test_padding_between_edges_has_no_effect(present: list[bool]) -> None:
     inputs, valid = camera_inputs.graph(1, 15, torch.float64), torch.tensor(present)

@@ -16,7 +16,7 @@ WORDS = st.lists(st.text("abz09#,", min_size=1, max_size=6), max_size=3)
 NAMES = st.builds(lambda first, words: f"rgb/{' '.join([first, *words])}.png", st.text("abz09_-", min_size=1), WORDS)
 """File names with spaces; after the first space also with characters that begin a comment or separate columns."""
 
-FILE_SETTINGS = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FILE_SETTINGS = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @given(

@@ -52,7 +52,7 @@ def encode(pixels: NDArray[np.generic], chosen: int) -> bytes:
 
 @pytest.mark.parametrize("kind", ["grey", "rgb", "depth"])
 @pytest.mark.parametrize("chosen", FILTERS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(height=st.integers(1, 20), width=st.integers(1, 20), seed=st.integers(0, 1000))
 def test_pixels_of_all_filters_are_those_that_were_written(
     kind: str, chosen: int, height: int, width: int, seed: int

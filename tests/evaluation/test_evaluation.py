@@ -35,7 +35,7 @@ def test_errors_do_not_depend_on_world_frame_of_estimate(xi: list[float]) -> Non
 
 
 @given(scale=st.floats(0.05, 20), seed=st.integers(0, 1000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_wrong_depth_unit_is_noted(scale: float, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     steps = torch.randn(60, 6, dtype=torch.float64, generator=generator) * 0.02
@@ -54,7 +54,7 @@ def test_wrong_depth_unit_is_noted(scale: float, seed: int) -> None:
 
 
 @given(seed=st.integers(0, 1000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_estimate_of_other_shape_has_no_depth_unit_note(seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     stamps = torch.arange(60, dtype=torch.float64) / 10

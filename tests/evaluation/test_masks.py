@@ -45,7 +45,7 @@ def all_people(truth: Tensor) -> Tensor:
 
 
 @given(st.lists(st.integers(0, 10_000), min_size=1, max_size=4))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
     evaluation = MaskEvaluation()
     counts = {"moving": [0, 0], "static": [0, 0], "anywhere": [0, 0]}
@@ -71,7 +71,7 @@ def test_fractions_equal_a_loop_over_pixels(seeds: list[int]) -> None:
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_tally_of_batch_equals_tally_of_each_image(seed: int) -> None:
     masked = torch.stack([random_mask(seed + k) for k in range(6)]).reshape(2, 3, H, W)
     region = torch.stack([random_mask(seed + 6 + k) for k in range(6)]).reshape(2, 3, H, W)
@@ -124,7 +124,7 @@ def test_people_in_view_have_enough_pixels_with_depth() -> None:
 
 
 @given(st.integers(0, 10_000), st.lists(st.integers(1, 40), unique=True, max_size=6))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_covering_objects_equal_a_loop_over_sets_of_pixels(seed: int, ids: list[int]) -> None:
     truth = random_truth(seed)
     people = all_people(truth)
@@ -167,7 +167,7 @@ def to_tensors(visits: list[tuple[float, int]]) -> tuple[Tensor, Tensor]:
 
 
 @given(VISITS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_id_switches_equal_a_loop_over_frames(visits: list[tuple[float, int]]) -> None:
     last, switches = 0, 0
     for gap, id_ in visits:
@@ -180,7 +180,7 @@ def test_id_switches_equal_a_loop_over_frames(visits: list[tuple[float, int]]) -
 
 
 @given(VISITS)
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_id_switches_are_invariant_to_renaming_and_grow_with_absence(visits: list[tuple[float, int]]) -> None:
     stamps, ids = to_tensors(visits)
     renamed = torch.tensor([0, 17, 4, 9])[ids]

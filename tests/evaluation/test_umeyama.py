@@ -39,7 +39,7 @@ def test_convention_transform_maps_p_to_q() -> None:
     torch.testing.assert_close(single.double(), T_qp, rtol=0, atol=1e-5)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.lists(st.integers(0, 3), min_size=12, max_size=12).filter(lambda counts: sum(map(bool, counts)) > 3))
 def test_weights_count_pairs_and_padding_does_not(counts: list[int]) -> None:
     p, q = normal(12, 3), normal(12, 3, seed=1)

@@ -76,7 +76,7 @@ def test_any_input_can_have_batch_dimensions(name: str, count: int) -> None:
         assert torch.equal(nested, torch.stack(expected).expand(2, 3, count))
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.integers(0, 99), st.integers(0, 30), st.integers(0, 30))
 def test_matches_with_padding_are_those_without_it(seed: int, rows: int, columns: int) -> None:
     """Both implementations; many descriptors are equal, so that the first of several nearest ones counts."""

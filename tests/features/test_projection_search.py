@@ -29,7 +29,7 @@ def test_projection_matching_finds_near_features_with_similar_descriptors() -> N
 
 
 @given(seed=st.integers(0, 1000), landmarks=st.integers(0, 60), features=st.integers(0, 60), spread=st.floats(1, 300))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_projection_matching_equals_exhaustive_search(seed: int, landmarks: int, features: int, spread: float) -> None:
     """Including projections outside the image, and search radii from almost 0 to the whole image."""
     generator = torch.Generator().manual_seed(seed)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.features.sampling import draw_samples, find_best_hypothesis, gather_samples
 
 
-@settings(deadline=None)
 @given(st.lists(st.booleans(), min_size=5, max_size=30), st.integers(0, 99))
 def test_samples_contain_different_valid_elements(present: list[bool], seed: int) -> None:
     valid = torch.tensor([present, [True] * len(present)])

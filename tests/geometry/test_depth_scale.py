@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -29,7 +29,6 @@ def stored(metres: NDArray[np.floating], scale: float, step: float = 0.0) -> NDA
     return np.clip(np.rint(measured * scale), 0, 65535).astype(np.uint16)
 
 
-@settings(deadline=None)
 @given(
     scale=st.sampled_from(sorted(UNITS)),
     step=st.sampled_from([0.0, 0.001, 0.002, 0.005, 0.01]),

@@ -6,7 +6,7 @@ import math
 
 import pytest
 import torch
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -35,7 +35,6 @@ def test_convention_level_camera_has_x_forward_y_left_z_up() -> None:
     assert (R @ -down).tolist() == [0, 0, 1]
 
 
-@settings(deadline=None)
 @given(directions)
 def test_is_a_rotation_that_turns_up_to_z(up: Tensor) -> None:
     assume(float(up.norm()) > 1e-3)
@@ -46,7 +45,6 @@ def test_is_a_rotation_that_turns_up_to_z(up: Tensor) -> None:
     assert T_lw[:3, 3].tolist() == [0, 0, 0] and T_lw[3].tolist() == [0, 0, 0, 1]
 
 
-@settings(deadline=None)
 @given(directions, st.floats(0.1, 10))
 def test_yaw_of_the_camera_is_zero_and_length_has_no_effect(up: Tensor, length: float) -> None:
     assume(float(up[:2].norm()) > 0.2 * float(up.norm()) > 1e-3)

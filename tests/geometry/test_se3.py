@@ -82,7 +82,7 @@ def test_log_of_half_turns() -> None:
     torch.testing.assert_close(se3_log(se3_exp(xi)).abs(), xi, rtol=0, atol=1e-13)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-1.7, 1.7), min_size=6, max_size=6))
 def test_group_laws(numbers: list[float]) -> None:
     xi = torch.tensor(numbers, dtype=torch.float64)

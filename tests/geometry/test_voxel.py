@@ -50,7 +50,7 @@ def test_pooling_equals_group_by(dtype: torch.dtype, count: int) -> None:
     assert voxels.means.shape[1] == voxels.valid.sum(dim=1).max()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     cloud=st.lists(st.tuples(*[st.integers(-40, 40)] * 3), max_size=300),
     copies=st.integers(1, 3),

@@ -40,7 +40,7 @@ def assert_twins_agree(boxes: torch.Tensor, window: Window, seed: int, cut: int 
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(count=st.integers(0, 6), seed=st.integers(0, 10_000))
 def test_masks_of_random_boxes_are_equal(window: Window, count: int, seed: int) -> None:
     size = torch.tensor([window.image_width, window.image_height])

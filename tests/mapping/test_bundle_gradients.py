@@ -81,7 +81,7 @@ def test_convention_a_weight_counts_an_observation_so_many_times() -> None:
     torch.testing.assert_close(found.T_cw, expected.T_cw, rtol=0, atol=1e-6)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(max_examples=15)
 @given(st.lists(st.booleans(), min_size=OBSERVATIONS, max_size=OBSERVATIONS))
 def test_padding_between_observations_has_no_effect(present: list[bool]) -> None:
     inputs, valid = camera_inputs.bundle(1, OBSERVATIONS, torch.float64), torch.tensor(present)

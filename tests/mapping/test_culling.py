@@ -84,7 +84,7 @@ OBSERVED = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=80)
+@settings(max_examples=80)
 @given(OBSERVED, st.sampled_from([0.3, 0.5, 0.9]), st.integers(1, 4))
 def test_culled_keyframes_equal_a_plain_count(observed: list[Observed], ratio: float, views: int) -> None:
     culled = cull(make_map(observed), redundant_ratio=ratio, redundant_views=views)

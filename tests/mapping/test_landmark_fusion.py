@@ -159,7 +159,7 @@ def test_fusion_without_neighbours_changes_nothing() -> None:
     assert all(torch.equal(old, keyframe.landmarks) for old, keyframe in zip(before, room.map.keyframes, strict=True))
 
 
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(st.lists(st.lists(st.integers(-1, 30), min_size=8, max_size=8), min_size=1, max_size=5), st.integers(0, 2**16))
 def test_table_and_keyframes_agree_after_any_fusion(matches: list[list[int]], seed: int) -> None:
     sparse_map = make_map()

@@ -21,7 +21,7 @@ def combine(prior: Readout, slope: float, curvature: float) -> Readout:
     return Readout(*map(float, combine_readouts(*numbers)))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.floats(0, 0.03), st.floats(0, 0.03), st.floats(1e3, 1e8), st.floats(1e3, 1e8))
 def test_calibration_with_a_quadratic_cost_is_the_weighted_mean(a: float, b: float, prior: float, new: float) -> None:
     calibrated = combine(Readout(a, prior), slope=2 * new * (a - b), curvature=2 * new)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from v3d_torch.mapping.tensor_table import TensorTable, unique_ids
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.lists(st.integers(0, 300), max_size=8))
 def test_table_contains_all_appended_rows(counts: list[int]) -> None:
     table = TensorTable(number=((), torch.int64), position=((2,), torch.float64))

@@ -46,7 +46,7 @@ def test_chamfer_distance_equals_the_equation(n: int, m: int, dtype: torch.dtype
 SHAPES = {"box": (1.0, 1.0, 1.0), "sheet": (1.0, 2.0, 0.01), "line": (1.0, 0.0, 0.0)}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(1, 20_000),
@@ -98,7 +98,7 @@ def test_memory_is_linear() -> None:
     assert kilobytes("VmHWM") - before < 100_000  # the distance matrix in float32: 1.2 GB
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     p=st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=1, max_size=80),
     q=st.lists(st.tuples(*[st.integers(-20, 20)] * 3), min_size=1, max_size=80),

@@ -52,7 +52,7 @@ def test_labels_equal_scikit_learn(listing: str, count: int, min_samples: int, d
     np.testing.assert_array_equal(labels, oracle(points.astype(np.float64), eps, min_samples))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     cells=st.lists(st.tuples(*[st.integers(-12, 12)] * 3), max_size=250),
     copies=st.integers(1, 3),
@@ -73,7 +73,7 @@ def test_labels_of_random_small_clouds_equal_scikit_learn(
 SHAPES = {"box": (1.0, 1.0, 1.0), "sheet": (1.0, 2.0, 0.01), "line": (1.0, 0.0, 0.0)}
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(1, 20_000),

@@ -55,7 +55,7 @@ def test_no_features_and_no_objects_are_accepted() -> None:
     assert support.supports(torch.zeros(0, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).shape == (0,)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**31), st.integers(1, 4), st.floats(0.1, 1.0), st.integers(1, 8))
 def test_support_equals_counting_one_by_one(seed: int, objects: int, min_ratio: float, min_inliers: int) -> None:
     generator = torch.Generator().manual_seed(seed)

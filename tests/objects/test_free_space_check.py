@@ -208,7 +208,7 @@ def test_static_object_behind_a_passing_one_has_vacated_nothing() -> None:
     assert vacated_fraction(surface((60, 80)), covered) == 0.0
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(TWISTS, st.integers(RIM, 20))
 def test_vacated_fraction_does_not_depend_on_the_world_frame(xi: tuple[float, ...], step: int) -> None:
     """The depth is chosen so that float32 rounding changes no pixel and no comparison."""
@@ -428,7 +428,7 @@ def test_new_box_appears_under_camera_motion(twist: tuple[float, ...]) -> None:
     assert torch.equal(appeared == 1, on_box)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(TWISTS)
 def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> None:
     """A loop correction moves the map and the camera: the newly occupied pixels stay the same."""
@@ -444,7 +444,7 @@ def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> No
 # ---------------------------------------------------------------- fractions of objects
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 5), st.integers(1, 40))
 def test_fraction_of_an_object_is_the_mean_of_its_known_pixels(
     seed: int, baselines: int, stride: int, min_pixels: int

@@ -596,7 +596,7 @@ def test_end_of_a_guess_moves_what_was_seen_since_or_all(all_tracks: bool) -> No
     assert all_tracks or float(track.velocity.norm()) < 0.05
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.tuples(*[st.floats(-2.0, 2.0)] * 3, *[st.floats(-1.0, 1.0)] * 3))
 def test_world_correction_moves_the_whole_track(xi: tuple[float, ...]) -> None:
     """After a correction, everything is as if the world had been the corrected one from the start."""

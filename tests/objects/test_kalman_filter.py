@@ -19,7 +19,7 @@ from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.lists(st.tuples(st.floats(0.01, 0.5), st.floats(-0.3, 0.3), st.floats(0.02, 0.5)), min_size=1, max_size=8))
 def test_kalman_filter_equals_least_squares(steps: list[tuple[float, float, float]]) -> None:
     """Oracle: SciPy solves for the states at all times at once, with whitened residuals."""

@@ -145,7 +145,7 @@ def test_lens_distortion_does_not_fold_points_into_the_image(degrees: float) -> 
 
 
 @pytest.mark.parametrize(("height", "width"), [(120, 160), (117, 158), (5, 7)])
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 10_000), st.integers(0, 12))
 def test_each_point_is_near_and_agrees_with_its_own_depth(height: int, width: int, seed: int, margin: int) -> None:
     """With a strong lens, and with image sizes that are no multiple of a cell."""

@@ -31,7 +31,7 @@ def cloud_of_box(centre: Tensor, size: Tensor, yaw: float) -> Tensor:
     return (torch.cat([corners, torch.zeros(1, 3, dtype=torch.float64)]) @ turn.T + centre) @ R_LW
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(-3, 3), st.floats(0.2, 1.0), st.floats(1.2, 3.0), st.floats(0.1, 2.0))
 def test_box_of_corners_is_the_box(yaw: float, width: float, ratio: float, height: float) -> None:
     centre, size = torch.tensor([1.0, -2.0, 0.5]).double(), torch.tensor([width * ratio, width, height]).double()
@@ -44,7 +44,7 @@ def test_box_of_corners_is_the_box(yaw: float, width: float, ratio: float, heigh
     assert abs(math.remainder(math.atan2(forward[1], forward[0]) - box.yaw, 2 * math.pi)) < 1e-9
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.floats(-3, 3), st.integers(0, 3), st.floats(-0.6, 0.6))
 def test_moving_box_points_where_it_moves(yaw: float, quarter: int, beside: float) -> None:
     size = torch.tensor([1.0, 0.4, 1.5]).double()

@@ -44,7 +44,7 @@ def scene(count: int, moving: list[int], by: float, seed: int = 0) -> tuple[Tens
     return world, moved @ turn.T + torch.tensor([0.5, 0.1, -0.3], dtype=torch.float64)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     names=st.lists(st.sampled_from("abcdefgh"), unique=True),
     data=st.data(),

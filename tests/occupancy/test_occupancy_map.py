@@ -138,7 +138,7 @@ def test_masked_object_leaves_no_trace_and_nothing_is_seen_behind_it() -> None:
     assert occupancy.states(torch.tensor([[0.0, 0.0, 0.6]])).tolist() == [VoxelState.FREE]
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(distance=st.floats(0.8, 1.6), fraction=st.floats(0.02, 0.8), turn=st.floats(-0.3, 0.3), seed=st.integers(0, 99))
 def test_point_that_all_views_see_through_is_never_occupied(
     distance: float, fraction: float, turn: float, seed: int
@@ -180,7 +180,7 @@ def test_free_balls_equal_brute_force(radius: float, scattered: tuple[OccupancyM
     assert twin.torch(occupancy.blocks, points, radius, SIZE).tolist() == expected
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(point=st.tuples(*3 * [st.floats(-1, 1)]), radii=st.tuples(st.floats(0, 0.3), st.floats(0, 0.3)).map(sorted))
 def test_ball_in_a_free_ball_is_free(
     point: tuple[float, ...], radii: list[float], scattered: tuple[OccupancyMap, Tensor]

@@ -109,7 +109,7 @@ def test_rays_along_the_axes_and_voxel_boundaries_are_cast(function: Callable[..
 
 
 @pytest.mark.skipif(not compiler.ENABLED, reason="no compiled kernels")
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(pose=poses, seed=seeds)
 def test_kernel_equals_torch_exactly(pose: Tensor, seed: int) -> None:
     arguments = (*random_view(seed), CAMERA.rays, pose, VOXEL, MAX_DEPTH, TOLERANCE)
@@ -117,7 +117,7 @@ def test_kernel_equals_torch_exactly(pose: Tensor, seed: int) -> None:
     assert torch.equal(found.blocks, expected.blocks) and torch.equal(found.marks, expected.marks)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(pose=poses, seed=seeds)
 def test_blocks_are_unique_and_ascending(pose: Tensor, seed: int) -> None:
     found = observe_voxels(*random_view(seed), CAMERA.rays, pose, VOXEL, MAX_DEPTH, TOLERANCE)
@@ -125,7 +125,7 @@ def test_blocks_are_unique_and_ascending(pose: Tensor, seed: int) -> None:
     assert (found.marks > 0).any(dim=1).all()
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(pose=poses, seed=seeds, fraction=st.floats(0, 0.95))
 def test_point_that_is_seen_through_is_free_or_holds_another_surface(pose: Tensor, seed: int, fraction: float) -> None:
     depth, static = random_view(seed)
@@ -138,7 +138,7 @@ def test_point_that_is_seen_through_is_free_or_holds_another_surface(pose: Tenso
         assert end <= 0 or marks[voxel] == FREE or voxel in hits
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(pose=poses, seed=seeds)
 def test_moving_surfaces_are_not_hit_and_hide_what_is_behind(pose: Tensor, seed: int) -> None:
     depth, _ = random_view(seed)

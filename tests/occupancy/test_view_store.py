@@ -70,7 +70,7 @@ def test_samples_next_to_moving_pixels_are_not_static() -> None:
     assert torch.equal(view.static, expected)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(
     first=st.lists(st.floats(-2, 2), min_size=6, max_size=6), second=st.lists(st.floats(-2, 2), min_size=6, max_size=6)
 )
@@ -116,7 +116,7 @@ def test_farthest_views_are_removed_on_a_long_path(caplog: pytest.LogCaptureFixt
     assert "farthest from the camera" in caplog.text
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(x=st.lists(st.floats(0, 10), min_size=8, max_size=40))
 def test_newest_view_is_kept_and_the_order_does_not_change(x: list[float]) -> None:
     store, view = ViewStore(6), RangeView.sample(0, torch.ones(240, 320), ALL, 8)

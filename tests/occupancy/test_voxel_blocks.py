@@ -25,7 +25,7 @@ def random_observations(generator: torch.Generator) -> Observations:
     return Observations(blocks, torch.randint(0, 3, (len(blocks), VOLUME), generator=generator, dtype=torch.uint8))
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**31), views=st.integers(1, 6))
 def test_log_odds_equal_those_of_single_voxels(seed: int, views: int) -> None:
     generator = torch.Generator().manual_seed(seed)

@@ -26,7 +26,7 @@ from helpers.rendered_planes import (
     uniform,
     vertical_stripes,
 )
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -188,7 +188,6 @@ def test_unobservable_motion_along_a_wall_gives_none(paint: Paint, sigma: float)
         assert (align(a, b) is not None) is accepted
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**31))
 def test_random_images_with_invalid_values_give_none(seed: int) -> None:
     """Noise with holes, NaN and infinity, on a camera of odd size."""

@@ -44,7 +44,7 @@ def features_in(depth: Tensor, count: int = 300) -> Features:
 
 
 @given(delay=st.floats(-0.02, 0.02), scale=st.floats(-1, 1))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_compensated_depth_is_that_of_the_colour_image(delay: float, scale: float) -> None:
     velocity, expected = scale * VELOCITY, features_in(wall_depth(torch.eye(4, dtype=torch.float64))).depth
     delayed = wall_depth(se3_exp(delay * velocity))

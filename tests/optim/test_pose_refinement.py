@@ -155,7 +155,7 @@ def test_refinement_is_deterministic() -> None:
 # ---------------------------------------------------------------- batches, padding, weights
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.lists(st.booleans(), min_size=60, max_size=60), st.integers(1, 4))
 def test_padding_between_measurements_has_no_effect(present: list[bool], rounds: int) -> None:
     inputs, valid = camera_inputs.view(1, 60, torch.float64), torch.tensor([present])

@@ -15,9 +15,7 @@ from v3d_torch.errors import V3DError
 CRASHES = sorted((Path(__file__).parents[1] / "helpers" / "crashes").glob("*/*"))
 """Inputs that crashed a parser, by parser."""
 
-SEARCH = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-)
+SEARCH = settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 
 
 @st.composite

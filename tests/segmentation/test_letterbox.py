@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from v3d_torch.segmentation.letterbox import Window, letterbox
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(image_height=st.integers(20, 1200), image_width=st.integers(20, 1200))
 def test_window_covers_exactly_the_image_and_maps_back_to_its_edges(image_height: int, image_width: int) -> None:
     canvas, window = letterbox(torch.full((3, image_height, image_width), 255, dtype=torch.uint8), 96, 128)

@@ -60,7 +60,7 @@ def random_boxes(count: int, seed: int) -> Tensor:
     return torch.cat([corner, corner + 5 + 30 * torch.rand(count, 2, generator=generator)], dim=1)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(count=st.integers(1, 60), seed=st.integers(0, 10_000), threshold=st.sampled_from([0.0, 0.3, 0.7, 1.0]))
 def test_non_maximum_suppression_equals_kornia_within_each_class(count: int, seed: int, threshold: float) -> None:
     boxes = random_boxes(count, seed)
@@ -173,14 +173,14 @@ DETECTIONS = st.lists(st.tuples(rectangles(), st.sampled_from([PERSON, CHAIR])),
 MAX_OVERLAPS = st.sampled_from([0.31, 0.53, 0.71])  # not a ratio of two small pixel counts
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(DETECTIONS, MAX_OVERLAPS)
 def test_suppression_by_masks_equals_naive_loop(detections: list[tuple[Tensor, int]], max_overlap: float) -> None:
     masks, labels = [mask for mask, _ in detections], [label for _, label in detections]
     assert remaining(masks, labels, max_overlap) == naive(torch.stack(masks).numpy(), labels, max_overlap)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(DETECTIONS, MAX_OVERLAPS)
 def test_best_instance_is_kept_and_suppression_is_idempotent(
     detections: list[tuple[Tensor, int]], max_overlap: float

@@ -86,7 +86,7 @@ def test_pose_between_frames_is_interpolated_along_the_geodesic() -> None:
     torch.testing.assert_close(states.at(1.25).T_wc, START @ se3_exp(TWIST * 1.25))  # predicted
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(0, 1), st.integers(0, 10_000))
 def test_interpolated_covariance_is_an_upper_bound(fraction: float, seed: int) -> None:
     """It exceeds the covariance of the interpolated pose for independent and for equal errors of both frames."""

@@ -21,7 +21,7 @@ def test_history_without_frames_is_at_the_origin() -> None:
     assert torch.equal(camera.predict(3.0), EYE)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(twists, st.floats(0.01, 0.1), st.floats(0.01, 0.2))
 def test_prediction_of_constant_velocity_is_exact(twist: Tensor, step: float, ahead: float) -> None:
     camera = Camera()

@@ -195,7 +195,7 @@ def test_lost_frames_before_a_keyframe_of_a_lost_camera_belong_to_its_part(part:
 # --- corrections of keyframes
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(twists, twists)
 def test_poses_follow_corrections_of_their_keyframe(at: Tensor, correction: Tensor) -> None:
     """The pose relative to the keyframe stays the same when the back end moves the keyframe."""
