@@ -10,7 +10,7 @@ from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of, depth_of
 from helpers.videos import write_video
 
 from v3d_torch.datasets import SourceOptions, load_sequence
-from v3d_torch.datasets.video import VideoSequence
+from v3d_torch.datasets.video import VideoSequence, _open_frames
 from v3d_torch.errors import InputError
 
 
@@ -46,6 +46,15 @@ def test_frames_can_be_read_in_any_order(folder: Path, given: str, capfd: pytest
     with pytest.raises(IndexError):
         sequence[3]
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in /proc")
+def test_reading_starts_no_threads_that_would_block_a_forked_process(tmp_path: Path) -> None:
+    write_video(tmp_path / "large.avi", 30, [np.zeros((480, 640, 3), np.uint8)])
+    before = len(list(Path("/proc/self/task").iterdir()))
+    capture = next(iter(_open_frames(tmp_path / "large.avi")))
+    capture.retrieve()
+    assert len(list(Path("/proc/self/task").iterdir())) == before
 
 
 def test_fps_of_the_user_sets_the_timestamps(folder: Path) -> None:

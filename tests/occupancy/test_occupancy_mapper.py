@@ -64,8 +64,10 @@ def test_every_nth_reliable_frame_is_added() -> None:
     drive.add(0, 7)
     assert drive.mapper._store.frames == [0, 3, 6]
     drive.add(7, 13, TrackingStatus.LOST)
+    drive.keyframes[0].part = 1
     drive.add(13, 17, TrackingStatus.DISCONNECTED)
     assert drive.mapper._store.frames == [0, 3, 6]
+    drive.keyframes[0].part = 0
     drive.add(17, 19, TrackingStatus.ODOMETRY)
     assert drive.mapper._store.frames == [0, 3, 6, 18]
     drive.keyframes[1].part = 1
@@ -241,8 +243,8 @@ def test_unknown_floor_is_searched_every_32_views(monkeypatch: pytest.MonkeyPatc
     floor = Floor(-torch.eye(3, dtype=torch.float64)[1], 0.0, 1.0)
 
     def find_floor() -> Floor | None:
-        searched.append(len(drive.entries))
-        return floor if len(drive.entries) > 70 else None
+        searched.append(len(drive.poses))
+        return floor if len(drive.poses) > 70 else None
 
     monkeypatch.setattr(drive.mapper, "find_floor", find_floor)
     drive.add(0, 95)

@@ -191,9 +191,11 @@ def _check_depth_format(path: Path, capture: cv2.VideoCapture) -> None:
 
 def _open_frames(path: Path, *, is_depth: bool = False) -> Iterator[cv2.VideoCapture]:
     """Yield the video capture positioned at each frame in turn, to read its timestamp or retrieve its pixels."""
+    # A capture with threads of its own blocks a forked process, such as a worker of a data loader, that deletes it.
+    parameters = [cv2.CAP_PROP_N_THREADS, 1]
+    if is_depth:  # by default OpenCV converts all videos to 8-bit colour
+        parameters += [cv2.CAP_PROP_CONVERT_RGB, 0]
     with _silence_opencv():
-        # By default OpenCV converts all videos to 8-bit colour.
-        parameters = [cv2.CAP_PROP_CONVERT_RGB, 0] if is_depth else []
         capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, parameters)
     while capture.grab():
         yield capture
