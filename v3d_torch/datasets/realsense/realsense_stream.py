@@ -103,9 +103,8 @@ class RealSenseStream:
         domains = import_librealsense(self.name).timestamp_domain
         colour, depth = frames.get_color_frame(), frames.get_depth_frame()
         domain = colour.get_frame_timestamp_domain()
-        if (
-            domain == domains.system_time or domain != depth.get_frame_timestamp_domain()
-        ):  # times of arrival, or 2 clocks
+        # Stamps in the system's time are those of arrival.
+        if domain == domains.system_time or domain != depth.get_frame_timestamp_domain():
             return 0.0
         return depth_delay(colour.get_timestamp() / 1000, depth.get_timestamp() / 1000)
 
