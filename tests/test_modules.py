@@ -378,7 +378,7 @@ def test_match_instances_in_batches(batch: int, count: int, dtype: torch.dtype) 
 @pytest.mark.parametrize("dtype", DTYPES)
 @pytest.mark.parametrize("count", [0, 1, 100])
 def test_instance_tracker_keeps_ids(count: int, dtype: torch.dtype) -> None:
-    track = v3d.InstanceTracker(v3d.Config().objects.tracker, TRACKED, voxel_size=0.05)
+    track = v3d.InstanceTracker(v3d.Config().objects.tracker, TRACKED, v3d.Config().objects.clouds)
     here = torch.eye(4, dtype=torch.float64)
     for frame in range(3):
         instances, clouds, depth = boxes(count, 0.05 * frame, dtype)
