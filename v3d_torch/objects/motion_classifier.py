@@ -136,7 +136,10 @@ class MotionClassifier:
         Args:
             objects: Result of the last call. Objects that the tracker does not have are left as they are.
         """
-        places = {track.id: _place(track, self._last_stamp) for track in self.tracker.tracks}
+        # A correction replaces the clouds of the tracks, and most frames have none.
+        clouds = {id(each.cloud) for each in objects.objects}
+        moved = [track for track in self.tracker.tracks if id(track.newest.cloud) not in clouds]
+        places = {track.id: _place(track, self._last_stamp) for track in moved}
         return replace(objects, objects=[replace(each, **places.get(each.id, {})) for each in objects.objects])
 
     def propagate_instances(self, view: DepthView) -> Instances:

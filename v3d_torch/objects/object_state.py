@@ -56,6 +56,8 @@ class ObjectState:
         Args:
             stamp: Timestamp, not earlier than that of the state, seconds.
         """
+        if stamp == self.stamp:
+            return self
         dt, noise = stamp - self.stamp, self.acceleration_noise**2
         pp, pv, vv = self.variances
         pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
