@@ -13,7 +13,8 @@ from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.evaluation.summary import format_csv, format_latex, format_markdown, make_screen_tables
-from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.io.files import write_text
+from v3d_torch.io.parquet_file import write_parquet
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
@@ -121,8 +122,7 @@ def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:
         OutputError: If the folder is not writable or the disk is full.
     """
     rows = [_row(job, outcome, path.parent) for job, outcome in runs]
-    with atomic_write(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(rows, schema=_SCHEMA), temporary)
+    write_parquet(path, pa.Table.from_pylist(rows, schema=_SCHEMA))
 
 
 def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:

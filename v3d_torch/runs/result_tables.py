@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 import torch
 
 from v3d_torch.config.loading import dump_config
@@ -16,7 +14,8 @@ from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.geometry.se3 import invert
-from v3d_torch.io.files import atomic_write, write_text
+from v3d_torch.io.files import write_text
+from v3d_torch.io.parquet_file import write_parquet
 from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
@@ -84,9 +83,9 @@ class ResultTables:
         write_trajectory(folder / "keyframes.txt", self.keyframes)
         if self.groundtruth is not None:
             write_trajectory(folder / "groundtruth.txt", self.groundtruth)
-        _write_table(folder / "frames.parquet", self.frames)
-        _write_table(folder / "states.parquet", self.states)
-        _write_table(folder / "dynamics.parquet", self.dynamics)
+        write_parquet(folder / "frames.parquet", self.frames)
+        write_parquet(folder / "states.parquet", self.states)
+        write_parquet(folder / "dynamics.parquet", self.dynamics)
 
 
 def collect_tables(pipeline: Pipeline) -> ResultTables:
@@ -151,9 +150,3 @@ def _object_table(dynamics: ObjectTable) -> pa.Table:
     arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
     return pa.table(arrays, schema=_DYNAMICS)
 
-
-def _write_table(path: Path, table: pa.Table) -> None:
-    content = io.BytesIO()  # so that Python, and not pyarrow, writes the file and raises the errors
-    pq.write_table(table, content)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(content.getvalue())
