@@ -149,4 +149,3 @@ def _object_table(dynamics: ObjectTable) -> pa.Table:
     }
     arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
     return pa.table(arrays, schema=_DYNAMICS)
-
