@@ -289,7 +289,7 @@ def test_turning_camera_keeps_ids_of_flickering_classes() -> None:
 @pytest.mark.parametrize("there", [True, False])
 def test_visible_missed_object_is_not_matched_to_a_nearby_instance(there: bool) -> None:
     """The new board is within the gate and of the same class, but the first is still visible at its position."""
-    first, other = Board(-0.3), Board(0.28)
+    first, other = Board(-0.3), Board(0.22)
     track_boards = BoardTracker(5.0)
     track_thrice(track_boards, first)
     tracks = track_boards(*([replace(first, detected=False)] if there else []), other)

@@ -18,30 +18,51 @@ from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 
+NOISE = 0.04
+"""Standard deviation of a measured centroid, as in the filter, metres."""
+
+SLOW = 0.5
+"""Fraction of the variance of the offset that changes slowly."""
+
 
 @settings(max_examples=20)
 @given(st.lists(st.tuples(st.floats(0.01, 0.5), st.floats(-0.3, 0.3), st.floats(0.02, 0.5)), min_size=1, max_size=8))
 def test_kalman_filter_equals_least_squares(steps: list[tuple[float, float, float]]) -> None:
-    """Oracle: SciPy solves for the states at all times at once, with whitened residuals."""
-    config = TrackerConfig(max_speed=1e6, acceleration_noise=1.5)
-    motion = ConstantVelocityKalmanFilter(config)
-    stamp = 7.0
-    motion.update(stamp, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), 0.1)
-    size = 2 * len(steps) + 2
-    rows, right = [np.eye(size)[0] / 0.1, np.eye(size)[1]], [1.0 / 0.1, 0.0]  # first position, first velocity
+    """Oracle: SciPy solves for position, velocity and offset at all times at once, with whitened residuals."""
+    motion = ConstantVelocityKalmanFilter(TrackerConfig(max_speed=1e6, acceleration_noise=1.5))
+    stamp, before = 7.0, 0.1
+    motion.update(stamp, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64), before)
+    size = 4 * len(steps) + 4
+    unit = np.eye(size)  # of each time: position, velocity, slow and fast part of the offset
+    rows, right = [unit[1], unit[2] / (SLOW**0.5 * before)], [0.0, 0.0]
+
+    def measure(k: int, x: float, sigma: float) -> None:
+        rows.extend(
+            [unit[4 * k + 3] / ((1 - SLOW) ** 0.5 * sigma), (unit[4 * k] + unit[4 * k + 2] + unit[4 * k + 3]) / NOISE]
+        )
+        right.extend([0.0, x / NOISE])
+
+    measure(0, 1.0, before)
     for k, (dt, error, sigma) in enumerate(steps):
         stamp += dt
-        x = 1.0 + 0.8 * (stamp - 7.0) + error
+        x, correlation = 1.0 + 0.8 * (stamp - 7.0) + error, math.exp(-dt / 2.0)
         motion.update(stamp, torch.tensor([x, 2.0, 3.0], dtype=torch.float64), sigma)
-        noise = 1.5**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        step = np.zeros((2, size))
-        step[:, 2 * k : 2 * k + 4] = [[-1, -dt, 1, 0], [0, -1, 0, 1]]
-        rows += [*np.linalg.inv(np.linalg.cholesky(noise)) @ step, np.eye(size)[2 * k + 2] / sigma]
-        right += [0.0, 0.0, x / sigma]
-    position, velocity = lstsq(np.stack(rows), np.array(right))[0][-2:]
+        noise = np.zeros((3, 3))
+        noise[:2, :2] = 1.5**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        noise[2, 2] = SLOW * sigma**2 * (1 - correlation**2)
+        step = np.zeros((3, size))
+        step[:, 4 * k : 4 * k + 3] = [[-1, -dt, 0], [0, -1, 0], [0, 0, -correlation * sigma / before]]
+        step[:, 4 * k + 4 : 4 * k + 7] = np.eye(3)
+        rows += [*np.linalg.inv(np.linalg.cholesky(noise)) @ step]
+        right += [0.0, 0.0, 0.0]
+        measure(k + 1, x, sigma)
+        before = sigma
+    position, velocity, slow, fast = lstsq(np.stack(rows), np.array(right))[0][-4:]
     expected = torch.tensor([position + 0.2 * velocity, 2.0, 3.0], dtype=torch.float64)
     torch.testing.assert_close(motion.state.predict(stamp + 0.2).position, expected, rtol=0.0, atol=1e-7)
     torch.testing.assert_close(motion.state.velocity, torch.tensor([velocity, 0.0, 0.0], dtype=torch.float64))
+    seen = torch.tensor([position + slow + fast, 2.0, 3.0], dtype=torch.float64)
+    torch.testing.assert_close(motion.visible_state.position, seen, rtol=0.0, atol=1e-7)
 
 
 def test_kalman_filter_limits_the_speed() -> None:
@@ -52,24 +73,43 @@ def test_kalman_filter_limits_the_speed() -> None:
 
 
 def test_covariance_of_the_filter_is_that_of_its_errors() -> None:
-    """Monte Carlo: walks with white acceleration noise; 500 errors of position and velocity, whitened."""
+    """Monte Carlo: walks with white acceleration noise and a changing visible part; 500 whitened errors."""
     generator, config = np.random.default_rng(0), TrackerConfig(max_speed=1e6, acceleration_noise=2.0)
-    dt, sigma, squared = 0.1, 0.05, []
+    dt, squared, squared_visible = 0.1, [], []
     noise = 2.0**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    step = np.linalg.cholesky(noise)
+    step, correlation = np.linalg.cholesky(noise), math.exp(-dt / 2.0)
+    sigmas = [0.3, 0.2, *[0.05] * 6, 0.1, 0.2, 0.3, *[0.1] * 4]  # enters the image, and walks behind a table
     for _ in range(500):
         motion = ConstantVelocityKalmanFilter(config)
-        position, velocity = np.zeros(3), generator.normal(size=3)
-        for k in range(15):
-            measured = position + sigma * generator.normal(size=3)
-            motion.update(k * dt, torch.from_numpy(measured), sigma)
+        position, velocity, part = np.zeros(3), generator.normal(size=3), generator.normal(size=3)
+        for k, sigma in enumerate(sigmas):
+            fast = math.sqrt(1 - SLOW) * generator.normal(size=3)
+            seen = position + sigma * (math.sqrt(SLOW) * part + fast)
+            motion.update(k * dt, torch.from_numpy(seen + NOISE * generator.normal(size=3)), sigma)
             change = step @ generator.normal(size=(2, 3))
             position, velocity = position + dt * velocity + change[0], velocity + change[1]
-        predicted = motion.state.predict(15 * dt)
+            part = correlation * part + math.sqrt(1 - correlation**2) * generator.normal(size=3)
+        predicted = motion.state.predict(len(sigmas) * dt)
         error = np.concatenate([predicted.position.numpy() - position, predicted.velocity.numpy() - velocity])
         squared.append(error @ np.linalg.solve(predicted.covariance.numpy(), error))
-    low, high = chi2.ppf([0.001, 0.999], 6 * len(squared)) / len(squared)
-    assert low < np.mean(squared) < high
+        visible = motion.visible_state
+        squared_visible.append(
+            (visible.position.numpy() - seen) @ (visible.position.numpy() - seen) / visible.variances[0]
+        )
+    for found, degrees in ((squared, 6), (squared_visible, 3)):
+        low, high = chi2.ppf([0.001, 0.999], degrees * len(found)) / len(found)
+        assert low < np.mean(found) < high
+
+
+def test_velocity_of_a_part_is_known_sooner_than_the_place_of_the_whole() -> None:
+    """A person of whom a quarter is visible walks at 1 m/s: the offset of the part stays, so it hides no motion."""
+    motion = ConstantVelocityKalmanFilter(TrackerConfig())
+    for frame in range(30):
+        motion.update(frame / 30, torch.tensor([0.3 + frame / 30, 0.0, 2.0], dtype=torch.float64), 0.35)
+    assert float(motion.state.velocity[0]) == pytest.approx(1.0, abs=0.05)
+    assert motion.state.sigmas[1] < 0.7 and motion.state.sigmas[0] > 0.25
+    assert float(motion.visible_state.position[0]) == pytest.approx(0.3 + 29 / 30, abs=0.02)
+    assert motion.visible_state.sigmas[0] < NOISE
 
 
 def test_state_is_transformed_with_the_world() -> None:
@@ -80,6 +120,21 @@ def test_state_is_transformed_with_the_world() -> None:
     torch.testing.assert_close(moved.position, T[:3, :3] @ later.position + T[:3, 3])
     assert moved.variances == later.variances
     assert torch.equal(state.covariance, state.covariance.T) and state.sigmas == (1.0, math.sqrt(2.0))
+
+
+def test_filter_in_a_corrected_world_goes_on_as_if_it_had_measured_there() -> None:
+    T = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.4, 0.5, -0.6], dtype=torch.float64))
+    one, other = (ConstantVelocityKalmanFilter(TrackerConfig()) for _ in range(2))
+    points = torch.rand(8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for k, (point, sigma) in enumerate(zip(points, [0.3, 0.2, 0.1, 0.05, 0.05, 0.1, 0.2, 0.3], strict=True)):
+        if k == 5:
+            one.apply_world_correction(T)
+        one.update(0.1 * k, T[:3, :3] @ point + T[:3, 3] if k >= 5 else point, sigma)
+        other.update(0.1 * k, T[:3, :3] @ point + T[:3, 3], sigma)
+    for found, expected in ((one.state, other.state), (one.visible_state, other.visible_state)):
+        torch.testing.assert_close(found.position, expected.position)
+        torch.testing.assert_close(found.velocity, expected.velocity)
+        assert found.variances == expected.variances
 
 
 def make_state() -> ObjectState:

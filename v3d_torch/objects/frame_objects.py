@@ -35,7 +35,7 @@ class TrackedObject:
         mask: Pixels of the object, bool, shape :math:`(H, W)`; empty if it is hidden, or missed for more than 0.1 s,
             because later predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes the predicted
             pixels.
-        state: Position and velocity with their covariance at the time of the frame.
+        state: Position of the visible part and velocity, with their covariance, at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the baselines; the free-space check has one vote.
         chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured,
@@ -58,7 +58,7 @@ class TrackedObject:
 
     @property
     def centroid(self) -> Tensor:
-        """Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown."""
+        """Centroid of the visible part, world frame, metres, float64, shape :math:`(3,)`; NaN if unknown."""
         return self.state.position
 
     @property

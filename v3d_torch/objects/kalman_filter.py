@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -13,18 +14,32 @@ from v3d_torch.objects.object_state import ObjectState
 _INITIAL_SPEED_SIGMA = 1.0
 """Standard deviation of the initial velocity, m/s: a new object can be at rest or walk."""
 
+_CENTROID_SIGMA = 0.04
+"""Standard deviation of a measured centroid of the visible part, metres: noise of depth and of the contour."""
+
+_SLOW_FRACTION, _SLOW_TIME = 0.5, 2.0
+"""Fraction of the variance of the offset that changes slowly, because the same part is visible in consecutive frames,
+and its time constant, seconds: within seconds a person turns, or others walk by. The rest differs in each frame,
+because masks end at different places."""
+
 _MIN_SPEED = 1e-9
 """Lower bound of the speed as a divisor, m/s."""
 
 
 class ConstantVelocityKalmanFilter:
-    """Constant-velocity Kalman filter of one object, see `ObjectState`.
+    """Constant-velocity Kalman filter of one object, of which a changing part is visible.
+
+    A measured centroid is that of the visible part, which has an offset from that of the whole object. One part of the
+    offset is white noise. The other is a Gauss-Markov process (coloured measurement noise: Bar-Shalom, Li and
+    Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec. 8.2), and belongs to the state of
+    the filter: as white noise, it would be confused with motion.
 
     Args:
         config: Noise and maximum speed.
 
     Attributes:
-        state: Estimate after the last measurement.
+        state: Estimate for the whole object after the last measurement, see `ObjectState`.
+        visible_state: Estimate for its visible part, with the same velocity.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -32,23 +47,26 @@ class ConstantVelocityKalmanFilter:
         position = torch.full((3,), torch.nan, dtype=torch.float64)
         velocity = torch.zeros_like(position)
         self.state = ObjectState(0.0, position, velocity, (1.0, 0.0, 1.0), config.acceleration_noise)
+        self.visible_state = self.state
+        self._offset = torch.zeros_like(position)  # its slow part
+        self._offset_covariances = 0.0, 0.0, 0.0  # with position and velocity, and variance
+        self._offset_sigma = 0.0
 
     def update(self, stamp: float, position: Tensor, sigma: float) -> None:
-        """Update the state with a measured position.
+        """Update the state with a measured position of the visible part.
 
         Args:
             stamp: Timestamp, seconds, not before the last one.
             position: Measured position, world frame, metres, float64, shape :math:`(3,)`. NaN is ignored.
-            sigma: Standard deviation of each coordinate, metres.
+            sigma: Standard deviation of each coordinate of the offset of the visible part, metres.
         """
         if not bool(torch.isfinite(position).all()):
             return
         if self.state.is_known:
-            self.state = self._correct(self.state.predict(stamp), position, sigma)
+            self._predict(stamp, sigma)
+            self._correct(position)
         else:
-            variances = sigma**2, 0.0, _INITIAL_SPEED_SIGMA**2
-            velocity = torch.zeros_like(position)
-            self.state = replace(self.state, stamp=stamp, position=position, velocity=velocity, variances=variances)
+            self._start(stamp, position, sigma)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the state into the corrected world frame.
@@ -56,16 +74,47 @@ class ConstantVelocityKalmanFilter:
         Args:
             T_new_old: Transform from the old to the corrected world frame, float64, shape :math:`(4, 4)`.
         """
-        self.state = self.state.transform(T_new_old)
+        self.state, self.visible_state = self.state.transform(T_new_old), self.visible_state.transform(T_new_old)
+        self._offset = T_new_old[:3, :3] @ self._offset
 
-    def _correct(self, predicted: ObjectState, position: Tensor, sigma: float) -> ObjectState:
-        pp, pv, vv = predicted.variances
-        position_gain, velocity_gain = pp / (pp + sigma**2), pv / (pp + sigma**2)
-        innovation = position - predicted.position
-        velocity = predicted.velocity + velocity_gain * innovation
-        return replace(
-            predicted,
-            position=predicted.position + position_gain * innovation,
+    def _start(self, stamp: float, measured: Tensor, sigma: float) -> None:
+        """Start with a measured position and without velocity."""
+        variance, speed_variance = _CENTROID_SIGMA**2, _INITIAL_SPEED_SIGMA**2
+        known = replace(self.state, stamp=stamp, position=measured, velocity=torch.zeros_like(measured))
+        self.state = replace(known, variances=(sigma**2 + variance, 0.0, speed_variance))
+        self.visible_state = replace(known, variances=(variance, 0.0, speed_variance))
+        slow = _SLOW_FRACTION * sigma**2
+        self._offset_covariances, self._offset_sigma = (-slow, 0.0, slow), sigma
+
+    def _predict(self, stamp: float, sigma: float) -> None:
+        """Predict the state; the slow part of the offset decays, and scales with its standard deviation."""
+        dt, (po, vo, oo) = stamp - self.state.stamp, self._offset_covariances
+        correlation = math.exp(-dt / _SLOW_TIME)
+        scale = correlation * sigma / self._offset_sigma
+        self.state = self.state.predict(stamp)
+        self._offset = scale * self._offset
+        variance = scale**2 * oo + (1 - correlation**2) * _SLOW_FRACTION * sigma**2
+        self._offset_covariances, self._offset_sigma = (scale * (po + dt * vo), scale * vo, variance), sigma
+
+    def _correct(self, measured: Tensor) -> None:
+        """Correct the predicted state with a measurement: the sum of position, both parts of the offset, and noise."""
+        (pp, pv, vv), (po, vo, oo) = self.state.variances, self._offset_covariances
+        p, v, o = pp + po, pv + vo, po + oo  # covariances with the measurement
+        variance = p + o + (1 - _SLOW_FRACTION) * self._offset_sigma**2 + _CENTROID_SIGMA**2
+        residual = measured - self.state.position - self._offset
+        innovation = residual / variance
+        velocity = self.state.velocity + v * innovation
+        self.state = replace(
+            self.state,
+            position=self.state.position + p * innovation,
             velocity=velocity * min(1.0, self._max_speed / max(float(velocity.norm()), _MIN_SPEED)),
-            variances=(pp - position_gain * pp, pv - position_gain * pv, vv - velocity_gain * pv),
+            variances=(pp - p * p / variance, pv - p * v / variance, vv - v * v / variance),
         )
+        noise_fraction = _CENTROID_SIGMA**2 / variance
+        self.visible_state = replace(
+            self.state,
+            position=measured - noise_fraction * residual,
+            variances=(_CENTROID_SIGMA**2 * (1 - noise_fraction), v * noise_fraction, self.state.variances[2]),
+        )
+        self._offset = self._offset + o * innovation
+        self._offset_covariances = po - p * o / variance, vo - v * o / variance, oo - o * o / variance

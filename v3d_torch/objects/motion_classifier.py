@@ -221,7 +221,7 @@ class MotionClassifier:
 
 def _place(track: Track, stamp: float) -> dict[str, Any]:
     """Return the attributes of a `TrackedObject` in the world frame."""
-    return {"state": track.predict_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}
+    return {"state": track.predict_visible_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}
 
 
 def _unions_of_masks(tracks: Sequence[Track], labels: set[int]) -> dict[int, NDArray[np.bool_]]:

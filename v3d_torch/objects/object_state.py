@@ -19,7 +19,8 @@ class ObjectState:
 
     Attributes:
         stamp: Timestamp, seconds.
-        position: Centroid, world frame, metres, float64, shape :math:`(3,)`; NaN before the first centroid.
+        position: Centroid of the object or of its visible part, world frame, metres, float64, shape :math:`(3,)`;
+            NaN before the first centroid.
         velocity: World frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid.
         variances: Of each axis: variance of the position, covariance of position and velocity, variance of the
             velocity; square metres, m^2/s and m^2/s^2.

@@ -15,9 +15,9 @@ from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 
-_CENTROID_SIGMA = 0.05
-"""Standard deviation of the centroid of a fully visible object, metres: arms and legs swing by more, the error of the
-mask contour is smaller."""
+_WHOLE_SIGMA = 0.05
+"""Standard deviation of the centroid of a fully visible object from that of the object, metres: arms and legs swing by
+more, and the camera sees one side."""
 
 _PARTIAL_SIGMA = 0.45
 """Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
@@ -107,7 +107,7 @@ class Track:
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
-        history: States after detections of the last 10 s, oldest first.
+        history: States of the visible part after detections of the last 10 s, oldest first.
     """
 
     id: int
@@ -169,7 +169,7 @@ class Track:
         return None
 
     def predict_state(self, stamp: float) -> ObjectState:
-        """Predict position and velocity with constant velocity (paper, Sec. II).
+        """Predict position and velocity of the whole object with constant velocity (paper, Sec. II).
 
         An object whose centroid has not been measured for longer, for example because it is too far for its depth, does
         not go on for ever, see `predict_return`.
@@ -177,9 +177,15 @@ class Track:
         Args:
             stamp: Timestamp, seconds.
         """
-        state = self._filter.state
-        moving = state.predict(min(stamp, state.stamp + _MAX_EXTRAPOLATION))
-        return moving if moving.stamp == stamp else self._predict_stop(moving, stamp)
+        return self._predict(self._filter.state, stamp)
+
+    def predict_visible_state(self, stamp: float) -> ObjectState:
+        """Predict position and velocity of the visible part of the object, like `predict_state`.
+
+        Args:
+            stamp: Timestamp, seconds.
+        """
+        return self._predict(self._filter.visible_state, stamp)
 
     def predict_cloud(self, stamp: float) -> Tensor:
         """Predict the cloud: the newest cloud, moved like the position in `predict_state`.
@@ -204,9 +210,12 @@ class Track:
         return self._predict_stop(self._filter.state, stamp)
 
     def centroid_sigma(self, detection: Detection3D) -> float:
-        """Return the standard deviation of each coordinate of the centroid of a detection, metres."""
+        """Return the standard deviation of the centroid of a detection from that of the whole object, metres.
+
+        It holds for each coordinate.
+        """
         fewer, more = sorted((len(detection.cloud), self._max_points))
-        return _CENTROID_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)
+        return _WHOLE_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)
 
     def add_detection(self, detection: Detection3D) -> None:
         """Add a detection, update the Kalman filter, and drop detections older than the history.
@@ -320,12 +329,16 @@ class Track:
                 if detection.stamp >= since:
                     self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
 
+    def _predict(self, state: ObjectState, stamp: float) -> ObjectState:
+        moving = state.predict(min(stamp, state.stamp + _MAX_EXTRAPOLATION))
+        return moving if moving.stamp == stamp else self._predict_stop(moving, stamp)
+
     def _predict_stop(self, state: ObjectState, stamp: float) -> ObjectState:
         return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
 
     def _remember_state(self) -> None:
         """Append the state to the history, at the rate of the history, and drop the states that are too old."""
-        state = self._filter.state
+        state = self._filter.visible_state
         if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
             oldest = state.stamp - _STATE_HISTORY
             self.history = [each for each in self.history if each.stamp >= oldest] + [state]
