@@ -109,7 +109,7 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             "stages",
             (
                 "Time of each stage, ms per frame. Stages run in parallel with those of the next frame, so that the"
-                " sum can exceed the time of a frame. `motion` is the odometry, `bundle` local bundle adjustment."
+                " sum can exceed the time of a frame. `bundle` is local bundle adjustment."
                 " `v3d-torch run --profile` prints such a table for any run."
             ),
             pivot_table("stage", "ms"),
