@@ -205,7 +205,7 @@ class V3DSLAM(FramePreprocessor):
         frame, depth = preprocessed.frame, preprocessed.extraction.depth
         check_order(frame, self.poses.stamp)
         self.timer.add(preprocessed.times)
-        with self.timer("motion"):  # III-E: camera motion since the previous frame, from its static pixels
+        with self.timer("odometry"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
             features = self._compensate(preprocessed.extraction.features, preprocessed, prediction.velocity)
             T_cp, current = prediction.motion_until(frame.stamp), TrackedFrame(frame, depth, features)

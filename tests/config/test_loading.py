@@ -26,7 +26,7 @@ def test_single_override_needs_no_list() -> None:
 
 
 def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
-    config = load_config(None, ["objects.voting.baselines=[0.0, 0.5]", "loop.enabled=false"])
+    config = load_config(None, ["objects.voting.time_spans=[0.0, 0.5]", "loop.enabled=false"])
     file = tmp_path / "config.yaml"
     file.write_text(dump_config(config))
     assert load_config(file) == config
@@ -46,8 +46,8 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("seed=010", "YAML reads a leading zero as octal; write 10 instead"),
         ("seed= 008", "YAML reads a leading zero as octal; write 8 instead"),
         ("segmentation.height=481", "multiple of 32"),
-        ("objects.free_space.baselines=[-0.3]", "free_space.baselines.0: input should be greater than or equal to 0"),
-        ("objects.free_space.baselines=[0.3,11]", "free_space.baselines.1: input should be less than or equal to 10"),
+        ("objects.free_space.time_spans=[-0.3]", "free_space.time_spans.0: input should be greater than or equal to 0"),
+        ("objects.free_space.time_spans=[0.3,11]", "free_space.time_spans.1: input should be less than or equal to 10"),
         ("dense_odometry.halvings=[-1]", "dense_odometry.halvings.0: input should be greater than or equal to 0"),
         ("dense_odometry.halvings=[13]", "dense_odometry.halvings.0: input should be less than or equal to 12"),
     ],

@@ -19,7 +19,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.rolling_shutter import Readout
 
 TIMED_STAGES = (
-    *("segmentation", "depth", "features", "motion", "free_space", "clouds", "objects", "tracking", "mapping"),
+    *("segmentation", "depth", "features", "odometry", "free_space", "clouds", "objects", "tracking", "mapping"),
     *("bundle", "loop", "plausibility"),
 )
 """Stages whose measured times are not compared."""

@@ -163,7 +163,9 @@ _METRICS = {
     **{"loops": 0, "failure": None, "fps": 3.5, "seconds": 0.6, "seconds_per_stage": {"read": 0.1}, "seed": 0},
     **{"peak_memory_mb": 300.0, "masks": None, "versions": {"torch": "2"}, "machine": {"threads": 1}},
 }
-_YAML = b"seed: 3\nobjects:\n  voting: {distance_threshold: 0.1, baselines: [0.0, 0.3]}\ncheckpoint: {interval: .inf}\n"
+_YAML = (
+    b"seed: 3\nobjects:\n  voting: {distance_threshold: 0.1, time_spans: [0.0, 0.3]}\ncheckpoint: {interval: .inf}\n"
+)
 
 SEEDS: dict[str, list[bytes]] = {
     "image list": [_LIST],

@@ -377,23 +377,23 @@ def test_dropped_views_are_not_compared() -> None:
 
 
 @pytest.mark.parametrize("rate", [5, 10, 30])
-def test_box_appears_for_the_time_of_each_baseline(rate: int) -> None:
-    """The box appears at 2 s, and is newly occupied over each baseline for the time of the baseline."""
+def test_box_is_newly_occupied_over_each_time_span(rate: int) -> None:
+    """The box appears at 2 s, and is newly occupied over each time span for as long as it."""
     check = check_with()
-    steps = {baseline: -(-round(baseline * 1000) * rate // 1000) for baseline in (0.3, 0.9)}  # whole frames
+    steps = {time_span: -(-round(time_span * 1000) * rate // 1000) for time_span in (0.3, 0.9)}  # whole frames
     for frame in range(4 * rate):
         current = view(*[WITH_BOX] * (frame >= 2 * rate), at=frame / rate)
         appeared = check(current).appeared
-        for row, baseline in zip(appeared, (0.3, 0.9), strict=True):
-            expected = 2 * rate <= frame < 2 * rate + steps[baseline]
-            if frame < steps[baseline]:
+        for row, time_span in zip(appeared, (0.3, 0.9), strict=True):
+            expected = 2 * rate <= frame < 2 * rate + steps[time_span]
+            if frame < steps[time_span]:
                 assert row.isnan().all()
             else:
                 assert (box(row) == expected).all() and (around(row) == 0).all()
         check.add_view(current, current.T_cw)
 
 
-def test_views_older_than_the_longest_baseline_are_dropped() -> None:
+def test_views_older_than_the_longest_time_span_are_dropped() -> None:
     check, stored, images = check_with(), [], []
     for frame in range(100):
         observed = view(at=frame / 10)
@@ -447,18 +447,18 @@ def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> No
 @settings(max_examples=50)
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 5), st.integers(1, 40))
 def test_fraction_of_an_object_is_the_mean_of_its_known_pixels(
-    seed: int, baselines: int, stride: int, min_pixels: int
+    seed: int, time_spans: int, stride: int, min_pixels: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    appeared = rng.choice([0.0, 1.0, np.nan], (baselines, 7, 9), p=[0.3, 0.2, 0.5])
+    appeared = rng.choice([0.0, 1.0, np.nan], (time_spans, 7, 9), p=[0.3, 0.2, 0.5])
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
     fractions = NewlyOccupied(torch.from_numpy(appeared), stride).fractions(
         [torch.from_numpy(mask) for mask in masks], min_pixels
     )
-    assert fractions.dtype == torch.float64 and fractions.shape == (3, baselines)
+    assert fractions.dtype == torch.float64 and fractions.shape == (3, time_spans)
     for row, mask in zip(fractions, masks, strict=True):
         within = [
-            [appeared[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(baselines)
+            [appeared[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(time_spans)
         ]
         known = [[value for value in values if not math.isnan(value)] for values in within]
         expected = [sum(values) / len(values) if len(values) >= min_pixels else math.nan for values in known]

@@ -545,15 +545,15 @@ def test_missing_centroid_in_one_frame_keeps_id_and_velocity() -> None:
     assert float(track.velocity[0]) == pytest.approx(0.9, abs=0.3)
 
 
-def test_detection_pair_spans_the_baseline() -> None:
+def test_detections_of_a_pair_are_at_least_the_time_span_apart() -> None:
     track_boards = BoardTracker()
     for frame in range(20):
         (track,) = track_boards(Board(-0.3 + 0.01 * frame))
-        pairs = {baseline: track.detection_pair(baseline) for baseline in (0.0, 0.3)}
+        pairs = {time_span: track.detection_pair(time_span) for time_span in (0.0, 0.3)}
         assert (pairs[0.0] is None) is (frame < 1)
         assert (pairs[0.3] is None) is (frame < 9)
-    for baseline, span in ((0.0, 1 / 30), (0.3, 0.3)):
-        previous, current = pairs[baseline] or (None, None)
+    for time_span, span in ((0.0, 1 / 30), (0.3, 0.3)):
+        previous, current = pairs[time_span] or (None, None)
         assert current is track.newest
         assert previous is not None
         assert current.stamp - previous.stamp == pytest.approx(span)

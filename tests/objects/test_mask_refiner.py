@@ -85,7 +85,7 @@ def test_previously_occupied_surface_is_excluded() -> None:
     appeared = torch.full((2, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
     appeared[0, 160 // STEP :] = 0.0
     assert abs(rows_below_cut(refine(depth_of(), appeared, surface_margin=100)) - (160 - CUT)) <= STEP
-    appeared[1, 160 // STEP :] = 1.0  # free over the other baseline: not static
+    appeared[1, 160 // STEP :] = 1.0  # free over the other time span: not static
     assert rows_below_cut(refine(depth_of(), appeared, surface_margin=100)) == ROWS.stop - CUT
 
 

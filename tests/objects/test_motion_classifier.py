@@ -332,7 +332,7 @@ def test_chamfer_is_measured_only_if_the_vote_is_static() -> None:
     assert all(frame[4].chamfer < 0.02 for frame in frames if frame.stamp > 2.4)
 
 
-SHORT = ("objects.voting.baselines=[0.0, 0.3]", "objects.free_space.baselines=[0.3]")  # compares over 0.3 s only
+SHORT = ("objects.voting.time_spans=[0.0, 0.3]", "objects.free_space.time_spans=[0.3]")  # compares over 0.3 s only
 
 
 @RATES
@@ -375,7 +375,7 @@ def test_dynamic_state_of_living_object_is_held_after_enough_evidence(min_frames
     """Two frames stage a false motion: the frame with the wrong depth, and the frame 0.3 s later."""
     overrides = (
         f"objects.static_mask.confirm_dynamic_frames={min_frames}",
-        "objects.voting.baselines=[0.3]",
+        "objects.voting.time_spans=[0.3]",
         "objects.chamfer.enabled=false",
     )
     frames = simulate(*CHAIRS, Thing(label, flashing), seconds=1.5, overrides=overrides)
@@ -386,7 +386,7 @@ def test_dynamic_state_of_living_object_is_held_after_enough_evidence(min_frames
 
 @RATES
 def test_standing_person_is_unknown_before_static(rate: float) -> None:
-    """The free-space check decides after its longest baseline, 0.9 s, or 1 s at 5 Hz; without it after 1 s."""
+    """The free-space check decides after its longest time span, 0.9 s, or 1 s at 5 Hz; without it after 1 s."""
     things = (walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0)), CHAIRS[0])
     for enabled, known in (("true", math.ceil(0.9 * rate) / rate), ("false", 1.0)):
         overrides = (f"objects.free_space.enabled={enabled}", "objects.chamfer.enabled=false")
@@ -416,7 +416,7 @@ def test_person_with_supporting_features_is_static(fitting: float, motion_state:
 @pytest.mark.parametrize("label", [PERSON, DOG])
 @pytest.mark.parametrize(("enabled", "motion_state"), [("true", MotionState.STATIC), ("false", MotionState.UNKNOWN)])
 def test_new_detection_of_old_surface_is_static_at_once(label: int, enabled: str, motion_state: MotionState) -> None:
-    """The network detects the object only after 1 s, when the free-space check has all its baselines."""
+    """The network detects the object only after 1 s, when the free-space check has all its time spans."""
     thing = walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0), label=label)
     overrides = (f"objects.free_space.enabled={enabled}",)
     frames = simulate(

@@ -18,7 +18,7 @@ from v3d_torch.types import Instances, RGBDFrame
 
 CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0, readout=0.0)
 RATE = 10
-FRAMES = range(1, 30)  # the longer baseline of the free-space check is reached before the box is carried
+FRAMES = range(1, 30)  # the longer time span of the free-space check is reached before the box is carried
 BOX, STILL_CHAIR = 3, 9
 
 

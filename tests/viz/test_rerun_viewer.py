@@ -100,9 +100,9 @@ class RunLog:
 
 CONFIG = (
     *("mapping.max_keyframe_interval=5", "objects.free_space.enabled=false"),
-    *("objects.voting.baselines=[0.3]", "objects.chamfer.baseline=0.0", "occupancy.enabled=true"),
+    *("objects.voting.time_spans=[0.3]", "objects.chamfer.time_span=0.0", "occupancy.enabled=true"),
 )
-"""A keyframe every five frames, and the paper's voting, over a baseline so long that Chamfer distances are measured
+"""A keyframe every five frames, and the paper's voting, over a time span so long that Chamfer distances are measured
 before an object is voted dynamic."""
 
 

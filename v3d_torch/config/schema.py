@@ -116,7 +116,7 @@ class VotingConfig(Section):
     """T_d, metres: a larger change of the distance between two centroids is a vote for both objects."""
     vote_threshold: int = Field(2, gt=0)
     """T_v, number of votes from which an object is dynamic (authors' code: more than one)."""
-    baselines: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
+    time_spans: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.0, 0.3, 0.9)
     """Times over which changes of distances are measured, seconds; 0 is the previous frame (the paper's rule). At 1 m/s
     a person moves 3 cm between frames at 30 Hz, which is within the noise of a centroid, and 30 cm in 0.3 s. Detections
     are stored for 1 s."""
@@ -131,7 +131,7 @@ class FreeSpaceConfig(Section):
 
     enabled: bool = True
     """False for the paper's literal rules."""
-    baselines: tuple[Annotated[float, Field(ge=0, le=10)], ...] = (0.3, 0.9)
+    time_spans: tuple[Annotated[float, Field(ge=0, le=10)], ...] = (0.3, 0.9)
     """Times between the depth images that are compared, seconds: a walking person moves 0.3 m in the first, a slow one
     in the second. Depth images are stored for the longest one."""
     min_unlabelled_area: float = Field(0.02, gt=0)
@@ -162,7 +162,7 @@ class ChamferConfig(Section):
     """Root-mean-square nearest-neighbour distance above which an object deforms, metres: sqrt(D / 2), where D is the
     paper's sum of two mean squares. Two samplings of a rigid surface by 2 cm voxels differ by 1 cm, and the noise of a
     Kinect at 3 m adds as much."""
-    baseline: float = Field(0.3, ge=0, le=1)
+    time_span: float = Field(0.3, ge=0, le=1)
     """Time between the two clouds that are compared, seconds; 0 is the previous frame (the paper's rule). Detections
     are stored for 1 s."""
     keep_deforming_features: bool = False

@@ -37,7 +37,7 @@ class TrackedObject:
             pixels.
         state: Position of the visible part and velocity, with their covariance, at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
-        votes: Number of votes in this frame, maximum over the baselines; the free-space check has one vote.
+        votes: Number of votes in this frame, maximum over the time spans; the free-space check has one vote.
         chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured,
             for example because the object is dynamic.
         motion_state: Static, dynamic, deforming or unknown.
@@ -76,7 +76,7 @@ class FrameObjects:
         static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
         static_without_people: Pixels of ``static_mask`` at a larger distance from moving objects and from people, even
             static ones, for the coloured map; bool, shape :math:`(H, W)`.
-        vote_pairs: Votes that counted over any baseline: id of the voting object and id of the object voted for,
+        vote_pairs: Votes that counted over any time span: id of the voting object and id of the object voted for,
             sorted.
     """
 

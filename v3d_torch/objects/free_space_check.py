@@ -37,8 +37,8 @@ _COLUMNS = 160
 """Number of pixels checked in a row: every 4th of a Kinect's. They are 2 cm apart at 2.5 m, as dense as the clouds."""
 
 _VIEW_MARGIN = 0.2
-"""Views are kept for this much longer than the longest baseline, seconds: at 5 frames per second, the newest view that
-is at least as old as the baseline can be one frame interval older."""
+"""Views are kept for this much longer than the longest time span, seconds: at 5 frames per second, the newest view that
+is at least as old as the time span can be one frame interval older."""
 
 
 class SpaceView(Protocol):
@@ -201,7 +201,7 @@ def _newly_occupied(
 
     Args:
         view: Current view.
-        earlier: Earlier view of each of B baselines; None if there is none.
+        earlier: Earlier view of each of B time spans; None if there is none.
         rays: Ray of every n-th pixel at unit depth, float64, shape (3, h * w).
         stride: Step n between the pixels.
         camera: Camera of all views.
@@ -252,7 +252,7 @@ class FreeSpaceCheck:
     """Comparison of each view with earlier views: pixels that newly occupy free space.
 
     Args:
-        config: Baselines and tolerances.
+        config: Time spans and tolerances.
         camera: Camera of all views.
     """
 
@@ -289,22 +289,22 @@ class FreeSpaceCheck:
                 everything would seem to appear; then nothing is compared.
 
         Returns:
-            Newly occupied pixels, one row per baseline; no row if nothing is compared.
+            Newly occupied pixels, one row per time span; no row if nothing is compared.
         """
         config = self._config
-        baselines = config.baselines if config.enabled and pose_known else ()
-        earlier = [self._newest_view_before(view.stamp - baseline) for baseline in baselines]
+        time_spans = config.time_spans if config.enabled and pose_known else ()
+        earlier = [self._newest_view_before(view.stamp - time_span) for time_span in time_spans]
         appeared = _newly_occupied(view, earlier, self._rays, self._stride, self._camera, config)
         return NewlyOccupied(appeared, self._stride)
 
     def add_view(self, view: DepthView, T_cw: Tensor) -> None:
-        """Store a view with its final pose, and drop the views that are too old for all baselines.
+        """Store a view with its final pose, and drop the views that are too old for all time spans.
 
         Args:
             view: View, newer than all stored ones.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         """
-        oldest = view.stamp - max(self._config.baselines, default=0.0) - _VIEW_MARGIN
+        oldest = view.stamp - max(self._config.time_spans, default=0.0) - _VIEW_MARGIN
         new = StoredView(view.stamp, view.nearest_depth, T_cw)
         self._views = [stored for stored in self._views if stored.stamp >= oldest] + [new]
 

@@ -35,7 +35,7 @@ from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import Instances
 
 _STATIC_FRACTION = 0.1
-"""An object is at rest over a baseline if less than this fraction of its pixels appeared: contours err by some
+"""An object is at rest over a time span if less than this fraction of its pixels appeared: contours err by some
 hundredths of an object."""
 
 _MIN_MISSED_SCORE = 0.3
@@ -85,8 +85,8 @@ class MotionClassifier:
             self.tracker.start_guess(stamp)
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]
-        baselines = (*config.voting.baselines, config.chamfer.baseline)
-        pairs = detection_pairs(detected, baselines, self.tracker.comparable_since)
+        time_spans = (*config.voting.time_spans, config.chamfer.time_span)
+        pairs = detection_pairs(detected, time_spans, self.tracker.comparable_since)
 
         # Independent evidence, not in the paper: free space.
         free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
@@ -97,7 +97,7 @@ class MotionClassifier:
             track.mark_dynamic(stamp)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
-        candidates = self._deformation_candidates(pairs[config.chamfer.baseline], stamp)
+        candidates = self._deformation_candidates(pairs[config.chamfer.time_span], stamp)
         chamfer = chamfer_evidence(candidates, free_space, config.chamfer)
         for track in chamfer.deforming:
             track.mark_deforming(stamp)
@@ -178,7 +178,7 @@ class MotionClassifier:
 
         Args:
             track: Track of the object.
-            appeared: Fraction of the object's pixels that appeared, for each baseline of the free-space check.
+            appeared: Fraction of the object's pixels that appeared, for each time span of the free-space check.
             stamp: Timestamp of the frame, seconds.
             supported: True if the features on the object fit the camera motion.
         """
@@ -190,7 +190,7 @@ class MotionClassifier:
         rarely_detected = track.total_score < _MIN_MISSED_SCORE and track.last_dynamic == -torch.inf
         if track.missed and (at_rest_over_all or rarely_detected):
             return MotionState.STATIC
-        # Gaits pause, but a rigid thing that is at rest over all known baselines has stopped.
+        # Gaits pause, but a rigid thing that is at rest over all known time spans has stopped.
         known = [rest for rest, fraction in zip(at_rest, appeared, strict=True) if not isnan(fraction)]
         if track.label in RIGID and known and all(known):
             return MotionState.STATIC

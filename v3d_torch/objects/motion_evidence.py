@@ -31,22 +31,22 @@ DetectionPairs = dict[Track, tuple[Detection3D, Detection3D]]
 
 
 def detection_pairs(
-    tracks: Iterable[Track], baselines: Iterable[float], since: float = -torch.inf
+    tracks: Iterable[Track], time_spans: Iterable[float], since: float = -torch.inf
 ) -> dict[float, DetectionPairs]:
     """Collect the pairs of detections to compare.
 
     Args:
         tracks: Tracks that are detected in the frame.
-        baselines: Minimum times between the two detections of a pair, seconds.
+        time_spans: Minimum times between the two detections of a pair, seconds.
         since: Time of the first detection that can be compared, seconds.
 
     Returns:
-        Pairs for each baseline.
+        Pairs for each time span.
     """
     tracks = list(tracks)
     return {
-        baseline: {track: pair for track in tracks if (pair := track.detection_pair(baseline, since)) is not None}
-        for baseline in set(baselines)
+        time_span: {track: pair for track in tracks if (pair := track.detection_pair(time_span, since)) is not None}
+        for time_span in set(time_spans)
     }
 
 
@@ -55,7 +55,7 @@ class FreeSpaceEvidence:
     """Result of the free-space check for the objects of a frame.
 
     Attributes:
-        appeared: Fraction of each object's pixels that appeared, for each baseline of the check; NaN if unknown.
+        appeared: Fraction of each object's pixels that appeared, for each time span of the check; NaN if unknown.
         vacated: Fraction of the points of each earlier detection whose position is free space now; NaN if unknown.
         enabled: False if the free-space check is turned off.
     """
@@ -65,7 +65,7 @@ class FreeSpaceEvidence:
     enabled: bool
 
     def has_appeared(self, track: Track) -> bool:
-        """Check whether most of an object appeared over some baseline; False if the check is turned off."""
+        """Check whether most of an object appeared over some time span; False if the check is turned off."""
         return self.enabled and any(fraction >= MOVED_FRACTION for fraction in self.appeared[track])
 
     def allows_motion(self, track: Track, previous: Detection3D, min_fraction: float) -> bool:
@@ -95,14 +95,14 @@ def free_space_evidence(
 
     Args:
         tracks: Tracks of the frame.
-        pairs: Pairs of detections for each baseline.
+        pairs: Pairs of detections for each time span.
         view: Depth and pose of the frame.
         newly_occupied: Newly occupied pixels of the frame.
         config: Tolerances.
         camera: Camera of the frame.
     """
     appeared = newly_occupied.fractions([track.cloud_pixels for track in tracks], config.min_points)
-    previous = list(dict.fromkeys(earlier for of_baseline in pairs.values() for earlier, _ in of_baseline.values()))
+    previous = list(dict.fromkeys(earlier for of_time_span in pairs.values() for earlier, _ in of_time_span.values()))
     vacated = vacated_fractions([detection.cloud for detection in previous], view, camera, config)
     return FreeSpaceEvidence(
         appeared=dict(zip(tracks, appeared.tolist(), strict=True)),
@@ -113,12 +113,12 @@ def free_space_evidence(
 
 @dataclass(frozen=True)
 class VoteEvidence:
-    """Result of Hough voting over all baselines.
+    """Result of Hough voting over all time spans.
 
     Attributes:
-        votes: Maximum number of votes of each compared object over the baselines.
-        dynamic: Objects that are voted dynamic over some baseline, or that appeared.
-        vote_pairs: Votes that counted over some baseline: id of the voting object and id of the object voted for,
+        votes: Maximum number of votes of each compared object over the time spans.
+        dynamic: Objects that are voted dynamic over some time span, or that appeared.
+        vote_pairs: Votes that counted over some time span: id of the voting object and id of the object voted for,
             sorted.
     """
 
@@ -134,14 +134,14 @@ def hough_vote_evidence(
     previous_stamp: float,
     config: VotingConfig,
 ) -> VoteEvidence:
-    """Vote over all baselines (paper, Alg. 1).
+    """Vote over all time spans (paper, Alg. 1).
 
     Args:
         detected: Tracks that are detected in the frame.
-        pairs: Pairs of detections for each baseline.
+        pairs: Pairs of detections for each time span.
         free_space: Result of the free-space check.
         previous_stamp: Timestamp of the previous frame, seconds.
-        config: Baselines and thresholds.
+        config: Time spans and thresholds.
 
     Returns:
         Votes and dynamic objects; empty if voting is turned off.
@@ -152,9 +152,9 @@ def hough_vote_evidence(
     vote_pairs: set[tuple[int, int]] = set()
     # A newly detected object has no earlier distance to compare, so only the free-space check votes for it.
     dynamic = {track for track in detected if free_space.has_appeared(track)}
-    for baseline in config.baselines:
-        compared = pairs[baseline]
-        if baseline == 0:  # only objects of the previous frame are compared (Alg. 1)
+    for time_span in config.time_spans:
+        compared = pairs[time_span]
+        if time_span == 0:  # only objects of the previous frame are compared (Alg. 1)
             compared = {track: pair for track, pair in compared.items() if pair[0].stamp >= previous_stamp}
         if not compared:
             continue

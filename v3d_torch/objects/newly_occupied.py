@@ -16,8 +16,8 @@ class NewlyOccupied:
     """Pixels whose point lies in space that earlier views observed as free.
 
     Attributes:
-        appeared: For each of B baselines, 1 if the space was free, 0 if it was occupied, NaN if unknown; float64, every
-            ``stride``-th pixel, shape :math:`(B, h, w)`.
+        appeared: For each of B time spans, 1 if the space was free, 0 if it was occupied, NaN if unknown; float64,
+            every ``stride``-th pixel, shape :math:`(B, h, w)`.
         stride: Step between the pixels, pixels.
     """
 
@@ -26,7 +26,7 @@ class NewlyOccupied:
 
     @property
     def previously_occupied(self) -> Tensor:
-        """Pixels whose space was occupied over at least one baseline and free over none, bool, shape :math:`(h, w)`."""
+        """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
         return (self.appeared == 0).any(dim=0) & ~(self.appeared == 1).any(dim=0)
 
     def fractions(self, masks: Sequence[Tensor], min_pixels: int) -> Tensor:
@@ -37,13 +37,13 @@ class NewlyOccupied:
             min_pixels: Minimum number of known pixels of an object.
 
         Returns:
-            Fraction for each object and baseline, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
+            Fraction for each object and time span, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
         """
-        baselines = len(self.appeared)
+        time_spans = len(self.appeared)
         if not masks:
-            return self.appeared.new_zeros(0, baselines)
+            return self.appeared.new_zeros(0, time_spans)
         inside = pack_masks(torch.stack([mask[:: self.stride, :: self.stride] for mask in masks]))
         indicators = pack_masks(torch.cat([self.appeared == 1, ~self.appeared.isnan()]))
         counts = count_common_pixels(inside, indicators).to(torch.float64)
-        new, known = counts[:, :baselines], counts[:, baselines:]
+        new, known = counts[:, :time_spans], counts[:, time_spans:]
         return (new / known).masked_fill(known < min_pixels, torch.nan)

@@ -41,7 +41,7 @@ _APPEARANCE_RATE = 0.1
 """Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
 
 _HISTORY = 1.0
-"""Detections are kept for this long, seconds. It bounds memory and the longest baseline of the vote."""
+"""Detections are kept for this long, seconds. It bounds memory and the longest time span of the vote."""
 
 _STATE_HISTORY, _HISTORY_INTERVAL = 10.0, 0.1 - 1e-3
 """Length of the history of states, and minimum time between two of them, seconds: for planners and drawings."""
@@ -151,11 +151,11 @@ class Track:
         """Estimated velocity, world frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid."""
         return self._filter.state.velocity
 
-    def detection_pair(self, baseline: float, since: float = -torch.inf) -> tuple[Detection3D, Detection3D] | None:
+    def detection_pair(self, time_span: float, since: float = -torch.inf) -> tuple[Detection3D, Detection3D] | None:
         """Return the newest detection and an earlier one to compare it with.
 
         Args:
-            baseline: Minimum time between both detections, seconds; 0 for the detection before the newest.
+            time_span: Minimum time between both detections, seconds; 0 for the detection before the newest.
             since: Time of the first detection that can be compared, seconds.
 
         Returns:
@@ -163,7 +163,7 @@ class Track:
         """
         current = self.newest
         for previous in reversed(self.detections[:-1]):
-            if current.stamp - previous.stamp >= baseline - STAMP_TOLERANCE:
+            if current.stamp - previous.stamp >= time_span - STAMP_TOLERANCE:
                 comparable = previous.stamp >= since and previous.has_centroid and current.has_centroid
                 return (previous, current) if comparable else None
         return None

@@ -274,11 +274,11 @@ CASES = [
         setting("features.levels=100"),
         Fails("--set: features.levels: input should be less than or equal to 20, got 100"),
     ),
-    Case("--set with no baselines", setting("objects.voting.baselines=[]"), Succeeds()),
+    Case("--set with no time spans", setting("objects.voting.time_spans=[]"), Succeeds()),
     Case(
-        "--set with negative baselines",
-        setting("objects.free_space.baselines=[-1]"),
-        Fails("--set: objects.free_space.baselines.0: input should be greater than or equal to 0, got -1"),
+        "--set with negative time spans",
+        setting("objects.free_space.time_spans=[-1]"),
+        Fails("--set: objects.free_space.time_spans.0: input should be greater than or equal to 0, got -1"),
     ),
     Case(
         "--set with a tiny voxel size",
