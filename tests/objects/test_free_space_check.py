@@ -447,19 +447,17 @@ def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> No
 @settings(max_examples=50)
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 5), st.integers(1, 40))
 def test_fraction_of_an_object_is_the_mean_of_its_known_pixels(
-    seed: int, time_spans: int, stride: int, min_pixels: int
+    seed: int, rows: int, stride: int, min_pixels: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    appeared = rng.choice([0.0, 1.0, np.nan], (time_spans, 7, 9), p=[0.3, 0.2, 0.5])
+    appeared = rng.choice([0.0, 1.0, np.nan], (rows, 7, 9), p=[0.3, 0.2, 0.5])
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
     fractions = NewlyOccupied(torch.from_numpy(appeared), stride).fractions(
         [torch.from_numpy(mask) for mask in masks], min_pixels
     )
-    assert fractions.dtype == torch.float64 and fractions.shape == (3, time_spans)
+    assert fractions.dtype == torch.float64 and fractions.shape == (3, rows)
     for row, mask in zip(fractions, masks, strict=True):
-        within = [
-            [appeared[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(time_spans)
-        ]
+        within = [[appeared[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(rows)]
         known = [[value for value in values if not math.isnan(value)] for values in within]
         expected = [sum(values) / len(values) if len(values) >= min_pixels else math.nan for values in known]
         torch.testing.assert_close(row, torch.tensor(expected).double(), equal_nan=True, rtol=1e-6, atol=0)

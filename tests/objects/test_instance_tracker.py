@@ -552,11 +552,11 @@ def test_detections_of_a_pair_are_at_least_the_time_span_apart() -> None:
         pairs = {time_span: track.detection_pair(time_span) for time_span in (0.0, 0.3)}
         assert (pairs[0.0] is None) is (frame < 1)
         assert (pairs[0.3] is None) is (frame < 9)
-    for time_span, span in ((0.0, 1 / 30), (0.3, 0.3)):
+    for time_span, expected in ((0.0, 1 / 30), (0.3, 0.3)):
         previous, current = pairs[time_span] or (None, None)
         assert current is track.newest
         assert previous is not None
-        assert current.stamp - previous.stamp == pytest.approx(span)
+        assert current.stamp - previous.stamp == pytest.approx(expected)
 
 
 def test_detection_pair_needs_both_centroids() -> None:

@@ -92,10 +92,8 @@ def test_covariance_of_the_filter_is_that_of_its_errors() -> None:
         predicted = motion.state.predict(len(sigmas) * dt)
         error = np.concatenate([predicted.position.numpy() - position, predicted.velocity.numpy() - velocity])
         squared.append(error @ np.linalg.solve(predicted.covariance.numpy(), error))
-        visible = motion.visible_state
-        squared_visible.append(
-            (visible.position.numpy() - seen) @ (visible.position.numpy() - seen) / visible.variances[0]
-        )
+        error = motion.visible_state.position.numpy() - seen
+        squared_visible.append(error @ error / motion.visible_state.variances[0])
     for found, degrees in ((squared, 6), (squared_visible, 3)):
         low, high = chi2.ppf([0.001, 0.999], degrees * len(found)) / len(found)
         assert low < np.mean(found) < high

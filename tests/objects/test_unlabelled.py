@@ -19,14 +19,12 @@ NO_INSTANCES = Instances.empty(120, 160)
 STRIDE = 4
 
 
-def newly_occupied(
-    *regions: tuple[slice, slice], time_spans: int = 2, height: int = 30, width: int = 40
-) -> NewlyOccupied:
+def newly_occupied(*regions: tuple[slice, slice], count: int = 2, height: int = 30, width: int = 40) -> NewlyOccupied:
     """Regions (rows, columns) that appeared over the last time span; nothing is known over the other time spans."""
-    appeared = torch.zeros(time_spans, height, width, dtype=torch.float64)
+    appeared = torch.zeros(count, height, width, dtype=torch.float64)
     appeared[:-1] = torch.nan
-    for rows, columns in regions:
-        appeared[-1, rows, columns] = 1.0
+    for v, u in regions:
+        appeared[-1, v, u] = 1.0
     return NewlyOccupied(appeared, STRIDE)
 
 
@@ -70,9 +68,9 @@ def test_separate_regions_are_separate_instances() -> None:
     assert {int(mask.sum()) for mask in proposed.masks} == {1600, 16 * 30, 16 * 80}
 
 
-@pytest.mark.parametrize("time_spans", [1, 2, 3])
-def test_region_over_one_time_span_is_proposed(time_spans: int) -> None:
-    assert len(propose(newly_occupied(REGION, time_spans=time_spans))) == 1
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_region_over_one_time_span_is_proposed(count: int) -> None:
+    assert len(propose(newly_occupied(REGION, count=count))) == 1
 
 
 def test_unknown_pixels_are_not_proposed() -> None:

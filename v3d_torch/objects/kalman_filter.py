@@ -31,7 +31,7 @@ class ConstantVelocityKalmanFilter:
 
     A measured centroid is that of the visible part, which has an offset from that of the whole object. One part of the
     offset is white noise. The other is a Gauss-Markov process (coloured measurement noise: Bar-Shalom, Li and
-    Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec. 8.2), and belongs to the state of
+    Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec. 8.4), and belongs to the state of
     the filter: as white noise, it would be confused with motion.
 
     Args:
@@ -101,20 +101,20 @@ class ConstantVelocityKalmanFilter:
         (pp, pv, vv), (po, vo, oo) = self.state.variances, self._offset_covariances
         p, v, o = pp + po, pv + vo, po + oo  # covariances with the measurement
         variance = p + o + (1 - _SLOW_FRACTION) * self._offset_sigma**2 + _CENTROID_SIGMA**2
-        residual = measured - self.state.position - self._offset
-        innovation = residual / variance
-        velocity = self.state.velocity + v * innovation
+        innovation = measured - self.state.position - self._offset
+        weighted = innovation / variance
+        velocity = self.state.velocity + v * weighted
         self.state = replace(
             self.state,
-            position=self.state.position + p * innovation,
+            position=self.state.position + p * weighted,
             velocity=velocity * min(1.0, self._max_speed / max(float(velocity.norm()), _MIN_SPEED)),
             variances=(pp - p * p / variance, pv - p * v / variance, vv - v * v / variance),
         )
         noise_fraction = _CENTROID_SIGMA**2 / variance
         self.visible_state = replace(
             self.state,
-            position=measured - noise_fraction * residual,
+            position=measured - noise_fraction * innovation,
             variances=(_CENTROID_SIGMA**2 * (1 - noise_fraction), v * noise_fraction, self.state.variances[2]),
         )
-        self._offset = self._offset + o * innovation
+        self._offset = self._offset + o * weighted
         self._offset_covariances = po - p * o / variance, vo - v * o / variance, oo - o * o / variance

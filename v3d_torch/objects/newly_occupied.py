@@ -39,11 +39,11 @@ class NewlyOccupied:
         Returns:
             Fraction for each object and time span, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
         """
-        time_spans = len(self.appeared)
+        rows = len(self.appeared)
         if not masks:
-            return self.appeared.new_zeros(0, time_spans)
+            return self.appeared.new_zeros(0, rows)
         inside = pack_masks(torch.stack([mask[:: self.stride, :: self.stride] for mask in masks]))
         indicators = pack_masks(torch.cat([self.appeared == 1, ~self.appeared.isnan()]))
         counts = count_common_pixels(inside, indicators).to(torch.float64)
-        new, known = counts[:, :time_spans], counts[:, time_spans:]
+        new, known = counts[:, :rows], counts[:, rows:]
         return (new / known).masked_fill(known < min_pixels, torch.nan)
