@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 import torch
@@ -102,6 +103,36 @@ def test_interpolated_covariance_is_an_upper_bound(fraction: float, seed: int) -
     assert torch.linalg.eigvalsh(got - independent).min() > -1e-9
     root = (1 - fraction) * torch.linalg.cholesky(a) + fraction * torch.linalg.cholesky(b)
     assert torch.linalg.eigvalsh(got - root @ root.T).min() > -1e-9
+
+
+@pytest.mark.parametrize("stamp", [0.05, 0.1, 0.17])
+def test_covariance_between_frames_covers_motions_of_a_hand(stamp: float) -> None:
+    """Paths of white acceleration noise, whose ends are known, have the covariance at a time between (Monte Carlo)."""
+    generator = torch.Generator().manual_seed(0)
+    steps, runs, elapsed = 100, 2000, 0.2
+    dt = elapsed / steps
+    sigma = torch.tensor([1.0] * 3 + [2.0] * 3, dtype=torch.float64)
+    twist, T, known = TWIST.expand(runs, 6), START.expand(runs, 4, 4), []
+    for _ in range(steps + 1):
+        known.append((T, twist))
+        noise = sigma * dt**0.5 * torch.randn(runs, 6, dtype=torch.float64, generator=generator)
+        T, twist = T @ se3_exp((twist + noise / 2) * dt), twist + noise
+    (true_T, true_twist), errors = known[round(stamp / dt)], []
+    for run in range(runs):
+        states = StateHistory()
+        for time, (pose, velocity) in ((0.0, known[0]), (elapsed, known[-1])):
+            states.append(replace(state(time, pose[run]), covariance=0 * SMALL, twist=velocity[run]))
+        between = states.at(stamp)
+        errors.append(torch.cat([se3_log(invert(between.T_wc) @ true_T[run]), true_twist[run] - between.twist]))
+    variance = torch.stack(errors).square().mean(dim=0)
+    expected = torch.cat([between.covariance.diagonal(), (between.twist_covariance - SMALL).diagonal()])
+    torch.testing.assert_close(variance, expected, rtol=0.15, atol=0.0)
+
+
+def test_covariance_in_a_gap_of_the_frames_covers_any_motion_within_it() -> None:
+    states = history(0.0, 2.0)
+    assert states.at(1.0).covariance[:3, :3].diagonal().sqrt().min() > 0.4  # the camera can move away and back
+    assert history(0.0, 0.03).at(0.015).covariance[:3, :3].diagonal().sqrt().max() < 0.0101
 
 
 def test_times_that_are_not_kept_are_input_errors() -> None:

@@ -115,3 +115,22 @@ def predict_covariance(covariance: Tensor, twist: Tensor, elapsed: float) -> Ten
     F[:6, 6:].diagonal().fill_(elapsed)
     noise = torch.tensor([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]], dtype=torch.float64)
     return F @ covariance @ F.T + torch.kron(noise, _TWIST_COVARIANCE)
+
+
+def interpolation_covariance(before: float, after: float) -> Tensor:
+    r"""Covariance of the errors of pose and twist that are interpolated between two known states.
+
+    Unknown acceleration moves the camera off the interpolated path. White noise of density q displaces it by the
+    variance :math:`q s^2 (T - s)^2 / 3 T` at the time s of an interval T, and its velocity by :math:`q s (T - s) / T`
+    (a Brownian bridge); both errors are independent.
+
+    Args:
+        before: Time since the state before, seconds.
+        after: Time until the state after, seconds.
+
+    Returns:
+        Covariance, float64, shape :math:`(12, 12)`.
+    """
+    bridge = before * after / (before + after)
+    noise = torch.tensor([before * after * bridge / 3, bridge], dtype=torch.float64).diag()
+    return torch.kron(noise, _TWIST_COVARIANCE)

@@ -13,6 +13,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.tracking.pose_kalman_filter import interpolation_covariance
 
 _DURATION = 10.0
 """Time for which states are stored, seconds, the same as in the transform buffer of ROS."""
@@ -51,8 +52,9 @@ class StateHistory:
     def at(self, stamp: float) -> CameraState:
         """Return the state at a time.
 
-        Between two frames the pose is interpolated along the geodesic; the covariance is an upper bound, which holds
-        for any correlation of their errors. After the last frame see `CameraState.predict`.
+        Between two frames the pose is interpolated along the geodesic. The covariance includes the unknown motion
+        between them, which is large in a gap of the frames, and is an upper bound for any correlation of the errors of
+        both frames. After the last frame see `CameraState.predict`.
 
         Args:
             stamp: Time, seconds.
@@ -95,9 +97,14 @@ def _interpolate(a: CameraState, b: CameraState, stamp: float) -> CameraState:
     fraction = (stamp - a.stamp) / (b.stamp - a.stamp)
     xi = se3_log(invert(a.T_wc) @ b.T_wc)
     Ad_a, Ad_b = adjoint(se3_exp(-fraction * xi)), adjoint(se3_exp((1 - fraction) * xi))
+    unknown_motion = interpolation_covariance(stamp - a.stamp, b.stamp - stamp)
     blended = {
-        name: (1 - fraction) * Ad_a @ getattr(a, name) @ Ad_a.T + fraction * Ad_b @ getattr(b, name) @ Ad_b.T
-        for name in ("covariance", "twist_covariance", "cross_covariance")
+        name: (1 - fraction) * Ad_a @ getattr(a, name) @ Ad_a.T + fraction * Ad_b @ getattr(b, name) @ Ad_b.T + added
+        for name, added in (
+            ("covariance", unknown_motion[:6, :6]),
+            ("twist_covariance", unknown_motion[6:, 6:]),
+            ("cross_covariance", unknown_motion[:6, 6:]),
+        )
     }
     return CameraState(
         stamp=stamp,
