@@ -131,7 +131,7 @@ def test_closing_stops_source_and_thread() -> None:
     assert set(threading.enumerate()) <= before
 
 
-def test_ten_minutes_without_a_consumer_keep_only_the_newest_frame() -> None:
+def test_ten_minutes_without_a_consumer_keep_only_the_first_and_the_newest_frame() -> None:
     """18,000 frames at 30 Hz arrive, and no thread takes any; every hundredth is late."""
     references: list[weakref.ref[RGBDFrame]] = []
 
@@ -149,6 +149,7 @@ def test_ten_minutes_without_a_consumer_keep_only_the_newest_frame() -> None:
     finally:
         logging.disable(logging.NOTSET)
     assert captured.rejected == 180
-    assert [index for index, reference in enumerate(references) if reference() is not None] == [17_998]
-    item = captured.frames.take()
+    assert [index for index, reference in enumerate(references) if reference() is not None] == [0, 17_998]
+    first, item = captured.frames.take(), captured.frames.take()
+    assert first is not None and (first.frame.index, first.number) == (0, 1)
     assert item is not None and (item.frame.index, item.number) == (17_998, 18_000 - 180)

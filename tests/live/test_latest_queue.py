@@ -1,4 +1,4 @@
-"""The queue that holds the newest item only."""
+"""The queue that holds the newest item only, and the first one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ import pytest
 from v3d_torch.live.latest_queue import LatestQueue
 
 
-def test_newer_item_replaces_the_one_that_waits() -> None:
+def test_newer_item_replaces_the_one_that_waits_but_not_the_first() -> None:
     queue = LatestQueue[int]()
     for item in range(1000):
         queue.put(item)
-    queue.close()
+    assert queue.take() == 0
     assert queue.take() == 999
+    for item in range(1000, 2000):
+        queue.put(item)
+    queue.close()
+    assert queue.take() == 1999
     assert queue.take() is None
 
 

@@ -6,6 +6,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from queue import Queue
 from typing import Any
 
@@ -81,6 +82,16 @@ def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -
     assert indices[0] == 0 and indices[-1] == FRAMES - 1 and len(indices) <= 4
     assert [result.dropped for result in results[1:]] == [b - a - 1 for a, b in itertools.pairwise(indices)]
     assert live.dropped == FRAMES - len(indices) == sum(result.dropped for result in results)
+
+
+def test_first_frame_is_tracked_although_later_ones_wait_at_the_start() -> None:
+    """Only the first frame has a measured gravity."""
+    down = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+    frames = [replace(Wall()[index], gravity=down if index == 0 else None) for index in range(FRAMES)]
+    live = LiveSLAM(frames, V3DSLAM(CAMERA, square))
+    first = next(iter(live))
+    assert first.frame.index == 0 and first.dropped == 0
+    assert live.slam.gravity is not None and live.slam.gravity.allclose(down)
 
 
 def test_tracking_does_not_wait_for_a_slow_network_on_every_frame() -> None:

@@ -1,4 +1,4 @@
-"""Queue between two threads that contains only the newest item."""
+"""Queue between two threads that contains only the newest item, and the first one until it is taken."""
 
 from __future__ import annotations
 
@@ -9,39 +9,44 @@ _T = TypeVar("_T")
 
 
 class LatestQueue(Generic[_T]):
-    """Queue of length one: a new item replaces an item that was not taken yet.
+    """Queue in which a new item replaces an item that was not taken yet, except the first item of all.
 
-    One thread puts items and closes the queue, another thread takes them. At most one item waits.
+    One thread puts items and closes the queue, another thread takes them. At most one item waits, or two until the
+    first is taken. The first frame of a camera must not be dropped: it can be the only one with a measured gravity.
     """
 
     def __init__(self) -> None:
         self._changed = Condition()
-        self._item: _T | None = None
+        self._items: list[_T] = []
+        self._is_first_waiting = True
         self._is_closed = False
         self._error: BaseException | None = None
 
     def put(self, item: _T) -> None:
-        """Put an item, and discard an item that waits. A closed queue ignores the item."""
+        """Put an item, and discard an item that waits, unless it is the first. A closed queue ignores the item."""
         with self._changed:
             if not self._is_closed:
-                self._item = item
+                first = self._items[:1] if self._is_first_waiting else []
+                self._items = [*first, item]
                 self._changed.notify()
 
     def take(self) -> _T | None:
         """Wait for an item and remove it.
 
         Returns:
-            The newest item; None if the queue is closed and empty.
+            The first item of all, then the newest item; None if the queue is closed and empty.
 
         Raises:
             BaseException: The error with which the queue was closed, after its last item was taken.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._item is not None or self._is_closed)
-            item, self._item = self._item, None
-        if item is None and self._error is not None:
+            self._changed.wait_for(lambda: self._items or self._is_closed)
+            if self._items:
+                self._is_first_waiting = False
+                return self._items.pop(0)
+        if self._error is not None:
             raise self._error
-        return item
+        return None
 
     def close(self, error: BaseException | None = None) -> None:
         """Accept no more items. Only the first call has an effect.
