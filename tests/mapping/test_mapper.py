@@ -26,15 +26,16 @@ class FrameFeeder:
         overrides = [f"mapping.{key}={value}" for key, value in settings.items()]
         config = load_config(overrides=[*overrides, "mapping.bundle_keyframes=0"])
         self.mapper = Mapper(config, CAMERA, SparseMap.empty(config, CAMERA))
-        self.index = -1
+        self.index, self.counts, self.stamp = -1, True, -1 / 30
 
     def __call__(self, matched: int, status: TrackingStatus = TRACKED, feature_count: int = 400) -> bool:
         """Process the next frame; returns whether it became a keyframe."""
-        self.index += 1
+        self.index += self.counts
+        self.stamp += 1 / 30
         image, depth = torch.zeros(3, 480, 640, dtype=torch.uint8), torch.zeros(1, 480, 640)
         landmarks = torch.full((feature_count,), -1)
         landmarks[:matched] = torch.arange(matched)
-        frame = RGBDFrame(self.index, self.index / 30, image, depth)
+        frame = RGBDFrame(self.index, self.stamp, image, depth)
         keyframes = self.mapper.map.keyframes
         reference = keyframes[-1] if keyframes else None
         return self.mapper(frame, features(feature_count), FramePose(status, EYE, landmarks), reference) is not None
@@ -68,6 +69,10 @@ def test_keyframe_is_inserted_after_the_maximum_interval() -> None:
     feed = FrameFeeder(max_keyframe_interval=5)
     inserted = [feed(0, LOST)] + [feed(300) for _ in range(15)]
     assert [index for index, is_keyframe in enumerate(inserted) if is_keyframe] == [0, 5, 10, 15]
+    feed.index = 0  # the camera was started again
+    assert [feed(300) for _ in range(10)] == 2 * [False, False, False, False, True]
+    feed.counts = False
+    assert [feed(300) for _ in range(10)] == 2 * [False, False, False, False, True]
 
 
 def test_map_continues_by_odometry_after_the_delay_and_stays_connected() -> None:
@@ -146,7 +151,7 @@ def continue_from(original: FrameFeeder, *, with_state: bool, **settings: int | 
     feeder.mapper.map.load_state_dict(copy.deepcopy(original.mapper.map.state_dict()))
     if with_state:
         feeder.mapper.load_state_dict(original.mapper.state_dict())
-    feeder.index = original.index
+    feeder.index, feeder.stamp = original.index, original.stamp
     return feeder
 
 
@@ -159,6 +164,13 @@ def test_mapper_with_the_state_of_another_mapper_restarts_at_the_same_frame() ->
     inserted = [[feeder(0, LOST) for _ in range(12)] for feeder in (original, restored, without_state)]
     assert inserted[0] == inserted[1] and any(inserted[0])
     assert not any(inserted[2])
+
+
+def test_mapper_with_the_state_of_another_mapper_has_the_same_interval() -> None:
+    original = FrameFeeder(max_keyframe_interval=5)
+    assert original(0, LOST) and not any(original(300) for _ in range(3))
+    restored = continue_from(original, with_state=True, max_keyframe_interval=5)
+    assert [[feeder(300), feeder(300)] for feeder in (original, restored)] == 2 * [[False, True]]
 
 
 def test_mapper_with_the_state_of_another_mapper_has_the_same_tracking_threshold() -> None:

@@ -84,6 +84,16 @@ def test_pose_is_refined_with_the_velocity_of_both_sides() -> None:
     assert scene.poses.statuses == 2 * [TrackingStatus.TRACKED]
 
 
+def test_frame_with_the_index_of_the_newest_keyframe_is_not_that_keyframe() -> None:
+    """A camera that is started again counts from 0 again, and a user's loop may not count at all."""
+    scene = Scene()
+    before, keyframe = scene.pose_error(), scene.map.keyframes[-1]
+    features_before = keyframe.features
+    scene.refine(replace(scene.previous, frame=replace(scene.previous.frame, index=keyframe.frame)))
+    assert scene.pose_error() < 0.1 * before
+    assert keyframe.features is features_before
+
+
 def test_pose_is_more_accurate_with_a_better_velocity() -> None:
     """Bundle adjustment corrects keyframes; the poses between them are corrected here only."""
     scene = Scene()

@@ -337,7 +337,7 @@ def test_map_and_poses_are_logged_again_after_loop_correction(tmp_path: Path) ->
             T_new_old = se3_exp(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.3, 0.0], dtype=torch.float64))
             slam.map.move_keyframes(slam.map.T_cw @ invert(T_new_old))
             slam.loop_closer.loop_count += 1
-            slam.map.keyframes[-1].frame = frame.index
+            slam.map.keyframes[-1].stamp = frame.stamp
             viewer.show(frame, result, slam, {})
         log(frame, result)
 

@@ -93,6 +93,18 @@ class MapTables:
         """ID of a part without keyframes, see `Keyframe`; not 0, which is the part where the map starts."""
         return max((keyframe.part for keyframe in self.keyframes), default=0) + 1
 
+    def keyframe_at(self, stamp: float) -> Keyframe | None:
+        """Return the newest keyframe if the frame at a time became it; None otherwise.
+
+        Times identify frames: they increase, whereas the indices of a camera begin again when it is started again.
+
+        Args:
+            stamp: Timestamp of the newest frame, or of the one before, seconds.
+        """
+        newest = self.keyframes[-1] if self.keyframes else None
+        is_at = newest is not None and newest.stamp == stamp and not newest.is_from_earlier_run
+        return newest if is_at else None
+
     def join_parts(self, a: int, b: int) -> None:
         """Join two parts, see `Keyframe`, in place; the joined part has the lower of both IDs.
 

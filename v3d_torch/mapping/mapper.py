@@ -36,6 +36,7 @@ class Mapper:
         self.map = sparse_map
         self._most_tracked = 0  # maximum number of landmarks that a frame matched since the last keyframe
         self._untracked_since: float | None = None  # timestamp, seconds
+        self._frames_since_keyframe = 0
 
     def __call__(
         self, frame: RGBDFrame, features: Features, pose: FramePose, reference: Keyframe | None
@@ -51,23 +52,29 @@ class Mapper:
         Returns:
             The new keyframe, or None.
         """
+        self._frames_since_keyframe += 1
         if not self._needs_keyframe(frame, features, pose):
             return None
         keyframe = self.map.insert_keyframe(frame.index, frame.stamp, pose.T_cw, features, pose.landmarks)
         if reference is not None:
             keyframe.part = self.map.unused_part if pose.status is TrackingStatus.LOST else reference.part
-        self._most_tracked, self._untracked_since = 0, None
+        self._most_tracked, self._untracked_since, self._frames_since_keyframe = 0, None, 0
         self._fuse_landmarks(self.map, keyframe)
         return keyframe
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the keyframe decision; the map has its own state."""
-        return {"most_tracked": self._most_tracked, "untracked_since": self._untracked_since}
+        return {
+            "most_tracked": self._most_tracked,
+            "untracked_since": self._untracked_since,
+            "frames_since_keyframe": self._frames_since_keyframe,
+        }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         self._most_tracked = state["most_tracked"]
         self._untracked_since = state["untracked_since"]
+        self._frames_since_keyframe = state["frames_since_keyframe"]
 
     def _needs_keyframe(self, frame: RGBDFrame, features: Features, pose: FramePose) -> bool:
         """Decide whether the map needs a keyframe, and update the counters of this decision."""
@@ -78,7 +85,7 @@ class Mapper:
         if pose.status is not TrackingStatus.TRACKED:
             return self._needs_untracked_keyframe(frame.stamp, features, pose.status)
         self._untracked_since = None
-        interval = frame.index - self.map.keyframes[-1].frame
+        interval = self._frames_since_keyframe
         if interval >= config.max_keyframe_interval:
             return True
         view_changed = pose.count < config.min_tracked_ratio * self._most_tracked

@@ -302,10 +302,10 @@ class Pipeline:
         for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
             if folder is not None:
                 write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)
-        keyframes = self.slam.map.keyframes
-        if keyframes and keyframes[-1].frame == frame.index:
+        keyframe = self.slam.map.keyframe_at(frame.stamp)
+        if keyframe is not None:
             static = result.static_without_people
-            self.views.add(keyframes[-1], frame.image, frame.depth, static, frame.depth_delay)
+            self.views.add(keyframe, frame.image, frame.depth, static, frame.depth_delay)
             if not self.record.was_checked:
                 self.record.people_sizes += apparent_sizes(result.objects, frame.depth, self.slam.camera)
             is_due = self._live is None and not self.record.was_checked

@@ -113,14 +113,14 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
 def _frame_table(pipeline: Pipeline) -> pa.Table:
     """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
     slam, times = pipeline.slam, pipeline.record.times
-    keyframes = torch.tensor([keyframe.frame for keyframe in slam.map.active_keyframes], dtype=torch.int64)
+    own = [keyframe.stamp for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
     statuses = slam.poses.statuses[: len(times)]  # one more if a frame was interrupted
     wall, cpu = times.wall.T.numpy(), times.cpu.T.numpy()
     columns = {
         "frame": times.indices.numpy(),
         "stamp": times.stamps.numpy(),
         "status": pa.array(statuses, pa.string()),
-        "keyframe": torch.isin(times.indices, keyframes).numpy(),
+        "keyframe": torch.isin(times.stamps, torch.tensor(own, dtype=torch.float64)).numpy(),
         **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
         **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
     }

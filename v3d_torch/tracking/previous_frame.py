@@ -47,10 +47,10 @@ class PreviousFrameRefinement:
         """
         if previous is None or previous.landmarks is None or velocity is None or not self._map.keyframes:
             return
-        newest, depth, delay = self._map.keyframes[-1], previous.depth, previous.frame.depth_delay
-        if newest.frame == previous.frame.index:
-            features = compensate(newest.features, depth, delay, velocity, self._map.readout)
-            self._map.update_features(newest, features)
+        keyframe, depth, delay = self._map.keyframe_at(previous.frame.stamp), previous.depth, previous.frame.depth_delay
+        if keyframe is not None:
+            features = compensate(keyframe.features, depth, delay, velocity, self._map.readout)
+            self._map.update_features(keyframe, features)
         elif self._refine_pose:
             matched, points = self._map.landmark_positions(previous.landmarks)
             features = compensate(previous.features[matched], depth, delay, velocity, self._map.readout)

@@ -88,8 +88,7 @@ class RunMessages:
         yield from self._pose_messages(stamp, slam)
         yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
         self._has_markers = True
-        keyframes = slam.map.keyframes
-        if keyframes and keyframes[-1].frame == frame.index:
+        if slam.map.keyframe_at(stamp) is not None:
             yield "/cloud", self._cloud(frame, objects.static_without_people)
             own = [each for each in slam.map.active_keyframes if not each.is_from_earlier_run]
             T_ml = frames.camera_in_map(invert(stack_poses(own)), self._T_mw)

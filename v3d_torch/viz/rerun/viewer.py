@@ -102,8 +102,6 @@ class RerunViewer:
         with slam.timer("viewer"):
             self._stream.set_time("frame", sequence=frame.index)
             self._stream.set_time("stamp", timestamp=frame.stamp)
-            keyframes = slam.map.keyframes
-            is_keyframe = bool(keyframes) and keyframes[-1].frame == frame.index
             T_wc = invert(slam.poses.T_cw)
             self._log_camera(frame, T_wc)
             log_objects(self._stream, objects, slam.up)
@@ -119,7 +117,7 @@ class RerunViewer:
             self._log_groundtruth(frame.stamp, T_wc, slam.poses.status)
             for stage, spent in stage_times.items():
                 self._stream.log(f"seconds/{stage}", rr.Scalars(spent.wall))
-            self._log_text(frame, objects, slam, is_keyframe)
+            self._log_text(frame, objects, slam)
 
     def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Log the final map and poses, and close the file and the connection.
@@ -198,13 +196,13 @@ class RerunViewer:
         self._stream.log("world/groundtruth", _lines([positions], "goldenrod"))
         self._unaligned = None
 
-    def _log_text(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, is_keyframe: bool) -> None:
+    def _log_text(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM) -> None:
         status = slam.poses.status or TrackingStatus.LOST
         heading = f"**frame {frame.index}** at {frame.stamp:.3f} s: {status.value}"
         summary = rr.TextDocument(f"{heading}\n\n{format_objects(objects)}", media_type="text/markdown")
         self._stream.log("frame_summary", summary)
         events = [status.value] if status is not TrackingStatus.TRACKED else []
-        events += [f"keyframe {len(slam.map.keyframes) - 1}"] if is_keyframe else []
+        events += [f"keyframe {len(slam.map.keyframes) - 1}"] if slam.map.keyframe_at(frame.stamp) is not None else []
         if slam.loop_closer.loop_count > self._loops:
             self._loops = slam.loop_closer.loop_count
             events.append("loop closed, map corrected")
