@@ -290,6 +290,9 @@ class V3DSLAM(FramePreprocessor):
     def state_dict(self) -> dict[str, Any]:
         """Return the state that changes from frame to frame. Call it between two frames.
 
+        The state shares its objects with the system: write it, or copy it with ``copy.deepcopy``, before the next
+        frame. `save_state` writes it to a file.
+
         Raises:
             ConfigError: If a stage was replaced by one without state_dict.
         """
@@ -297,7 +300,10 @@ class V3DSLAM(FramePreprocessor):
         return {**{name: each.state_dict() for name, each in self._components_with_state().items()}, **own}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption."""
+        """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption.
+
+        The objects of the state are shared, not copied.
+        """
         components = self._components_with_state()
         self.back_end.discard()  # it reads the map
         for name, component in components.items():
