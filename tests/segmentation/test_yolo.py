@@ -21,6 +21,7 @@ from v3d_torch.segmentation import COCO_NAMES, PERSON, YOLOSegmenter
 from v3d_torch.segmentation.export import exported_path
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.segmentation.weights import REGISTRY, find_weights
+from v3d_torch.segmentation.yolo import brighten
 from v3d_torch.types import RGBDFrame
 
 SMALL = {"height": 320, "width": 320, "threads": 1}
@@ -73,6 +74,24 @@ def test_cup_and_cat_are_detected(segmenter: YOLOSegmenter, name: str, label: st
     for mask, *edges in zip(instances.masks, left, top, right, bottom, strict=True):
         v, u = torch.nonzero(mask).T
         assert edges[0] <= u.min() and edges[1] <= v.min() and u.max() < edges[2] and v.max() < edges[3]
+
+
+@pytest.mark.parametrize(("name", "label"), [("coffee", "cup"), ("chelsea", "cat")])
+def test_detections_in_a_dark_image_have_the_scores_of_a_bright_one(name: str, label: str) -> None:
+    """Without brightening, the scores are below 0.5."""
+    image, segmenter = photograph(name), YOLOSegmenter(SegmentationConfig(threads=1))
+    dark, bright = segmenter.segment((image * 0.06).to(torch.uint8)), segmenter.segment(image)
+    assert COCO_NAMES[dark.labels[0]] == label
+    assert dark.scores[0] > bright.scores[0] - 0.05
+
+
+def test_only_dark_images_are_brightened() -> None:
+    image = photograph("coffee")
+    assert brighten(image) is image
+    dark = (image * 0.3).to(torch.uint8)
+    assert brighten(dark).float().mean() == pytest.approx(64, abs=2)
+    assert torch.equal(brighten((image * 0.04).to(torch.uint8)), (image * 0.04).to(torch.uint8) * 4)
+    assert not brighten(torch.zeros(3, 20, 20, dtype=torch.uint8)).any()
 
 
 def test_convention_channels_are_rgb(segmenter: YOLOSegmenter) -> None:
