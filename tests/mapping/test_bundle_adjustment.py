@@ -206,6 +206,22 @@ def test_degenerate_points_stay_finite() -> None:
     assert (result.points - scene.points)[good].norm(dim=1).median() < 0.02
 
 
+@pytest.mark.parametrize("with_gradient", [False, True], ids=["kernel", "torch"])
+def test_inverse_depth_that_is_not_finite_counts_as_not_measured(with_gradient: bool) -> None:
+    scene = Scene(poses=5, points=40, observers=4)
+    uv = scene.measured.uv.requires_grad_(with_gradient)
+    inverse_depth = scene.measured.inverse_depth.clone()
+    inverse_depth[[3, 50, 99]] = torch.tensor([torch.nan, torch.inf, -torch.inf], dtype=torch.float64)
+    not_measured = torch.where(inverse_depth.isfinite(), inverse_depth, 0.0)
+    found, expected = (scene.adjust(uv=uv, inverse_depth=depth) for depth in (inverse_depth, not_measured))
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one, other)
+    assert found.cost_after < found.cost_before
+    if with_gradient:
+        by_found, by_expected = (torch.autograd.grad(each.points.sum(), uv)[0] for each in (found, expected))
+        assert torch.equal(by_found, by_expected) and by_found.isfinite().all()
+
+
 def test_cost_without_a_fixed_pose_reaches_the_same_minimum() -> None:
     scene = Scene(poses=4, points=50, observers=4)
     free = torch.zeros(4, dtype=torch.bool)

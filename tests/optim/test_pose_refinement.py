@@ -145,6 +145,24 @@ def test_measurements_that_are_not_finite_are_outliers(with_gradient: bool) -> N
         assert points.grad is not None and points.grad.isfinite().all()
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("with_gradient", [False, True], ids=["kernel", "torch"])
+def test_inverse_depth_that_is_not_finite_counts_as_not_measured(value: float, with_gradient: bool) -> None:
+    T_cw, points, measured, _ = measure_landmarks(100)
+    inverse_depth, not_measured = measured.inverse_depth.clone(), measured.inverse_depth.clone()
+    inverse_depth[7], not_measured[7] = value, 0.0
+    depths = inverse_depth.requires_grad_(with_gradient), not_measured.requires_grad_(with_gradient)
+    given, sigmas = (points.requires_grad_(with_gradient), measured.uv, CAMERA.K), (measured.pixel_sigma, 0.0025)
+    found, expected = (refine_pose(perturb(T_cw), *given, depth, *sigmas) for depth in depths)
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one, other)
+    assert se3_log(found.T_cw @ invert(T_cw)).abs().max() < 0.005
+    if with_gradient:
+        by_found = torch.autograd.grad(found.T_cw.sum(), (points, inverse_depth))
+        by_expected = torch.autograd.grad(expected.T_cw.sum(), (points, not_measured))
+        assert torch.equal(by_found[0], by_expected[0]) and torch.equal(by_found[1], by_expected[1])
+
+
 def test_refinement_is_deterministic() -> None:
     T_cw, points, measured, _ = measure_landmarks(500, 0.3)
     first, second = (refine(perturb(T_cw), points, measured) for _ in range(2))

@@ -100,8 +100,8 @@ def bundle_adjust(
             any index for padding.
         point: Index of the observed landmark, from 0 to L - 1, int64, shape :math:`(*, M)`; any index for padding.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured. None if no depth was
-            measured.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0, NaN or infinite = not measured.
+            None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
         fixed: Mask of the poses that stay unchanged, bool, shape :math:`(*, P)`; None for only the first. Without a

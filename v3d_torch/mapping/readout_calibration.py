@@ -70,8 +70,8 @@ def estimate_readout(
         pose: Index of the pose from which each observation was made, int64, shape :math:`(*, M)`.
         point: Index of the observed landmark, int64, shape :math:`(*, M)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0 = not measured. None if no depth was
-            measured.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0, NaN or infinite = not measured.
+            None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
         fixed: Mask of the poses that stayed unchanged, bool, shape :math:`(*, P)`; None for only the first.

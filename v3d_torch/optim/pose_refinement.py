@@ -166,8 +166,8 @@ def refine_pose(
         points: Landmark of each measurement, world frame, metres, shape :math:`(*, N, 3)`.
         uv: Measured pixels, undistorted, shape :math:`(*, N, 2)`.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0 = not measured. None if no depth was
-            measured.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0, NaN or infinite = not measured.
+            None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, N)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, N)`.
         weights: Weight of each measurement, not negative, shape :math:`(*, N)`; None for 1.

@@ -75,16 +75,19 @@ def prepare_measurements(
 
     Args:
         uv: Undistorted pixels, shape :math:`(..., M, 2)`.
-        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(..., M)`; None = not measured.
+        inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(..., M)`; 0, NaN or infinite = not measured.
+            None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`.
         valid: Mask of the measurements that are not padding, bool, shape :math:`(..., M)`; None for all.
     """
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
+    inverse_depth = fill_padding(inverse_depth, valid, 0.0)
+    is_measured = (inverse_depth > 0) & (inverse_depth < torch.inf)
     return Measurements(
         uv=fill_padding(uv, None if valid is None else valid[..., None], 0.0),
-        inverse_depth=fill_padding(inverse_depth, valid, 0.0),
+        inverse_depth=torch.where(is_measured, inverse_depth, 0.0),
         pixel_sigma=fill_padding(pixel_sigma, valid, 1.0) if isinstance(pixel_sigma, Tensor) else pixel_sigma,
         inverse_depth_sigma=fill_padding(inverse_depth_sigma, valid, 1.0)
         if isinstance(inverse_depth_sigma, Tensor)
