@@ -48,6 +48,16 @@ def test_initial_guess_that_explains_half_of_the_points_skips_sampling(monkeypat
     assert guessed.inliers[:300].all() and guessed.inliers.sum() == sampled.inliers.sum()
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16, torch.bfloat16, torch.int64])
+def test_pose_does_not_depend_on_the_dtype_of_the_initial_guess(dtype: torch.dtype) -> None:
+    a, b, _ = two_views(outliers=100)
+    points = CAMERA.back_project(a.uv, a.depth)
+    guess = torch.eye(4, dtype=torch.float64)  # exact in all dtypes
+    found, expected = (pnp_ransac(points, b.uv, CAMERA.K, each) for each in (guess.to(dtype), guess))
+    assert expected.inliers[:300].all() and torch.equal(found.inliers, expected.inliers)
+    assert found.T_cw.dtype == torch.float64 and torch.equal(found.T_cw, expected.T_cw)
+
+
 def test_wrong_initial_guess_does_not_change_the_result() -> None:
     a, b, T_ba = two_views(outliers=100)
     points = CAMERA.back_project(a.uv, a.depth)

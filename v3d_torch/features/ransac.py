@@ -124,7 +124,8 @@ def pnp_ransac(
     def hypotheses() -> Iterator[tuple[Tensor, Tensor, Tensor]]:
         """Poses, a mask of the problems with a pose, and a mask of the points that refine it, (..., N)."""
         if initial_guess is not None:
-            predicted = initial_guess.detach().expand(*batch, 4, 4)
+            # The refined pose has the dtype of its prediction.
+            predicted = initial_guess.detach().to(torch.float64).expand(*batch, 4, 4)
             exists = predicted.isfinite().all(dim=-1).all(dim=-1)
             # The result of another pose is not used, but NaN would reach the gradients.
             identity = torch.eye(4, dtype=predicted.dtype, device=predicted.device)
