@@ -63,6 +63,20 @@ def test_edges_and_holes_have_no_normals() -> None:
     assert torch.equal(none, expected[1:-1, 1:-1])
 
 
+@pytest.mark.parametrize("radius", [0, 1])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+def test_gradients_beside_points_that_are_not_finite_are_those_beside_holes(value: float, radius: int) -> None:
+    plane, weights = slanted([0.5, 0.1, -1], 2.0)[0][:, 100:120, 100:130], torch.arange(1800.0).reshape(1, 20, 30, 3)
+    gradients = []
+    for hole in (value, 0.0):
+        points = plane.clone()
+        points[0, 5, 5] = points[0, 10, 7:9] = hole
+        normals = surface_normals(points.requires_grad_(), radius)
+        gradients += torch.autograd.grad((normals * weights).sum(), points)
+    assert gradients[0][0, 5, 7].any()
+    assert torch.equal(*gradients)
+
+
 @pytest.mark.parametrize(("distance", "degrees"), [(1.0, 1.5), (2.0, 3.0), (4.0, 6.0)])
 def test_normals_of_a_wall_with_kinect_noise_are_accurate(distance: float, degrees: float) -> None:
     """Noise and quantisation of disparity after Khoshelham and Elberink (Sensors 2012)."""

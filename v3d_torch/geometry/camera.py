@@ -313,8 +313,8 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
             per image; see `PinholeCamera.rays`.
 
     Returns:
-        Points in the camera frame, metres, dtype of ``depth``, shape :math:`(B, H, W, 3)`; (0, 0, 0) for pixels without
-        depth. Differentiable in ``depth`` and ``rays``.
+        Points in the camera frame, metres, dtype of ``depth``, shape :math:`(B, H, W, 3)`; (0, 0, 0) where the depth is
+        0, and not finite where it is not. Differentiable in ``depth`` and ``rays``.
     """
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     KORNIA_CHECK_SHAPE(rays, ["*", *map(str, depth.shape[2:]), "3"])

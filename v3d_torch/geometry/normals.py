@@ -49,6 +49,8 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     dtype = points.dtype
     points = points.to(working_dtype(dtype))
     z = points[..., 2]
+    # The products below mask these points, too, but their derivatives would make the gradients of neighbours NaN.
+    points = torch.where(points.isfinite().all(dim=-1, keepdim=True), points, 0.0)
     right, left, below, above = (_shift(points, *offset) for offset in ((0, 1), (0, -1), (1, 0), (-1, 0)))
     near = [(side[..., 2] > 0) & ((side[..., 2] - z).abs() <= edge_ratio * z) for side in (right, left, below, above)]
     # With x right and y down, this order makes the normals point towards the camera (-z).
