@@ -49,7 +49,7 @@ def make_problem(poses: int, points: int, observations: int, fixed: list[int], s
     is_fixed = torch.isin(torch.arange(poses), torch.tensor(fixed, dtype=torch.int64))
     start = se3_exp(0.01 * normal(poses, 6)) @ T_cw, positions + 0.02 * normal(points, 3)
     measured = uv, pose, point, CAMERA.K, inverse_depth, sigma, 0.003
-    problem, state = prepare_bundle(*start, *measured, is_fixed, weights, None)
+    problem, state, _ = prepare_bundle(*start, *measured, is_fixed, weights, None)
     return *state, problem
 
 

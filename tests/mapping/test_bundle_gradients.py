@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from helpers import camera_inputs
 from helpers.gradients import check_gradients, count_graph_nodes
@@ -97,6 +98,27 @@ def test_padding_between_observations_has_no_effect(present: list[bool]) -> None
     torch.testing.assert_close(found.points, expected.points, rtol=0, atol=1e-9)
     torch.testing.assert_close(found.chi2[:, valid], expected.chi2, rtol=1e-6, atol=1e-9)
     assert found.chi2[:, ~valid].isinf().all() and not found.inliers[:, ~valid].any()
+
+
+@pytest.mark.parametrize("with_gradient", [False, True], ids=["kernel", "torch"])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_observations_whose_pixel_is_not_finite_are_padding(value: float, with_gradient: bool) -> None:
+    inputs = camera_inputs.calibration(2, OBSERVATIONS, torch.float64)
+    readout = {name: inputs.pop(name) for name in ("seconds", "information", "readout_jacobian")}
+    uv, weights = inputs["uv"].clone(), inputs["weights"].requires_grad_(with_gradient)
+    uv[0, 8, 0], uv[1, 15] = value, -value
+    finite = uv.isfinite().all(dim=-1)
+    readout["readout_jacobian"][~finite] = torch.nan
+    results = []
+    for chosen in ({"uv": uv, "valid": None}, {"valid": finite}):
+        adjusted = bundle_adjust(**inputs | chosen)
+        state = {"T_cw": adjusted.T_cw, "points": adjusted.points}
+        results.append((*adjusted, *estimate_readout(**readout, **inputs | state | chosen)))
+        assert (adjusted.cost_after < adjusted.cost_before).all() and not adjusted.inliers[~finite].any()
+        if with_gradient:
+            results[-1] += torch.autograd.grad(results[-1][-2].sum() + adjusted.points.sum(), weights)
+    for one, other in zip(*results, strict=True):
+        assert torch.equal(one, other) and not one.isnan().any()
 
 
 def test_transforms_give_the_gradient() -> None:

@@ -11,7 +11,7 @@ from v3d_torch.mapping.reduced_cost import differentiate_minimum_cost
 
 
 def differentiate(scene: Scene, T_cw: Tensor, points: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
-    problem, state = prepare_bundle(T_cw, points, **scene.observations, weights=None, valid=None)
+    problem, state, _ = prepare_bundle(T_cw, points, **scene.observations, weights=None, valid=None)
     return differentiate_minimum_cost(problem, state, jacobian)
 
 

@@ -193,7 +193,7 @@ class SelfCalibration:
             The map with the derivatives.
         """
         T_cw, points = adjusted.T_cw, adjusted.points
-        problem, state = prepare_bundle(T_cw, points, **adjusted.arguments, weights=None, valid=None)
+        problem, state, _ = prepare_bundle(T_cw, points, **adjusted.arguments, weights=None, valid=None)
         derivatives = differentiate_minimum_cost(problem, state, self.jacobian(names, values, T_cw, points))
         return AdjustedMap(T_cw, points, *derivatives)
 

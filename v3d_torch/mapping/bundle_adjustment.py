@@ -107,7 +107,8 @@ def bundle_adjust(
         fixed: Mask of the poses that stay unchanged, bool, shape :math:`(*, P)`; None for only the first. Without a
             fixed pose the world frame can drift.
         weights: Weight of each observation, not negative, shape :math:`(*, M)`; None for 1.
-        valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all.
+        valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all. An observation
+            whose pixel is not finite counts as padding.
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
 
@@ -118,7 +119,7 @@ def bundle_adjust(
     Raises:
         InputError: If ``pose`` or ``point`` is not int64, or has an index out of range.
     """
-    problem, initial = prepare_bundle(
+    problem, initial, valid = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
     )
     start = initial[0].detach(), initial[1].detach()
@@ -129,7 +130,7 @@ def bundle_adjust(
         found = found._replace(T_cw=state[0], points=state[1], chi2=problem.chi2(residuals), cost_after=cost_after)
     else:
         found = _minimise(*start, *problem, iterations, tolerance)
-    chi2 = found.chi2 if valid is None else torch.where(valid, found.chi2, torch.inf)
+    chi2 = torch.where(valid, found.chi2, torch.inf)
     wide = working_dtype(T_cw.dtype)  # costs can exceed the range of half precision
     return BundleAdjustment(
         # Without a successful step, poses and landmarks are the tensors of the caller.

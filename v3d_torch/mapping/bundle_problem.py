@@ -205,13 +205,20 @@ def prepare_bundle(
     fixed: Tensor | None,
     weights: Tensor | None,
     valid: Tensor | None,
-) -> tuple[BundleProblem, State]:
-    """Return the problem and the initial state, in float64, for the arguments of `bundle_adjust`."""
+) -> tuple[BundleProblem, State, Tensor]:
+    """Prepare the arguments of `bundle_adjust`.
+
+    Returns:
+        The problem and the initial state, in float64, and the mask of the observations that are not padding, bool,
+        shape :math:`(..., M)`.
+    """
     KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "L", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])
     KORNIA_CHECK_SHAPE(point, ["*", str(pose.shape[-1])])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
+    valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     target = whiten(measured, K.to(torch.float64))
     if fixed is None:
@@ -235,4 +242,4 @@ def prepare_bundle(
         fixed=fixed.expand(*batch, T_cw.shape[-3]),
     )
     state = T_cw.to(torch.float64).expand(*batch, *T_cw.shape[-3:]), points.to(torch.float64)
-    return problem, (state[0], state[1].expand(*batch, *points.shape[-2:]))
+    return problem, (state[0], state[1].expand(*batch, *points.shape[-2:])), valid

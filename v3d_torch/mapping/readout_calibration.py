@@ -76,7 +76,8 @@ def estimate_readout(
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(*, M)`.
         fixed: Mask of the poses that stayed unchanged, bool, shape :math:`(*, P)`; None for only the first.
         weights: Weight of each observation, not negative, shape :math:`(*, M)`; None for 1.
-        valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all.
+        valid: Mask of the observations that are not padding, bool, shape :math:`(*, M)`; None for all. An observation
+            whose pixel is not finite counts as padding.
 
     Returns:
         The new ``seconds``, with the dtype of ``T_cw``, float32 for integers, and ``information``, at least in float32,
@@ -85,11 +86,11 @@ def estimate_readout(
     """
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
-    problem, state = prepare_bundle(
+    problem, state, valid = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
     )
     sigma = fill_padding(pixel_sigma, valid, 1.0)[..., None] if isinstance(pixel_sigma, Tensor) else pixel_sigma
-    derivative = -fill_padding(readout_jacobian, None if valid is None else valid[..., None], 0.0) / sigma
+    derivative = -fill_padding(readout_jacobian, valid[..., None], 0.0) / sigma
     by_readout = torch.cat([derivative, torch.zeros_like(derivative[..., :1])], dim=-1).mT.expand_as(problem.scale)
     slope, curvature = reduced_cost_derivatives(*state, *problem, by_readout)
     old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)

@@ -69,7 +69,7 @@ def prepare_measurements(
     inverse_depth: Tensor | None,
     pixel_sigma: Tensor | float,
     inverse_depth_sigma: Tensor | float,
-    valid: Tensor | None,
+    valid: Tensor,
 ) -> Measurements:
     """Convert measurements to float64, and replace the padding, so that it causes neither NaN nor gradients.
 
@@ -79,14 +79,14 @@ def prepare_measurements(
             None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`.
-        valid: Mask of the measurements that are not padding, bool, shape :math:`(..., M)`; None for all.
+        valid: Mask of the measurements that are not padding, bool, shape :math:`(..., M)`.
     """
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
     inverse_depth = fill_padding(inverse_depth, valid, 0.0)
     is_measured = (inverse_depth > 0) & (inverse_depth < torch.inf)
     return Measurements(
-        uv=fill_padding(uv, None if valid is None else valid[..., None], 0.0),
+        uv=fill_padding(uv, valid[..., None], 0.0),
         inverse_depth=torch.where(is_measured, inverse_depth, 0.0),
         pixel_sigma=fill_padding(pixel_sigma, valid, 1.0) if isinstance(pixel_sigma, Tensor) else pixel_sigma,
         inverse_depth_sigma=fill_padding(inverse_depth_sigma, valid, 1.0)
