@@ -6,7 +6,7 @@ from dataclasses import astuple
 
 import pytest
 import torch
-from helpers.observed_scenes import Scene
+from helpers.observed_scenes import CAMERA, Scene
 from helpers.rolling_camera import KINECT
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -17,8 +17,8 @@ from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
 
 
 def combine(prior: Readout, slope: float, curvature: float) -> Readout:
-    numbers = (torch.tensor(value, dtype=torch.float64) for value in (*astuple(prior), slope, curvature))
-    return Readout(*map(float, combine_readouts(*numbers)))
+    numbers = *astuple(prior), slope, curvature, abs(curvature)
+    return Readout(*map(float, combine_readouts(*(torch.tensor(each, dtype=torch.float64) for each in numbers))))
 
 
 @settings(max_examples=50)
@@ -61,3 +61,18 @@ def test_derivatives_of_the_minimum_cost_equal_finite_differences() -> None:
     seconds, information = estimate_readout(*state, **scene.observations)
     assert float(seconds) == pytest.approx(expected.seconds, abs=1e-6)
     assert float(information) == pytest.approx(expected.information, rel=0.05)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_change_that_a_pose_explains_keeps_the_estimate(noise: float) -> None:
+    """A translation of one camera along its x axis moves its pixels and keeps all depths."""
+    scene = Scene(poses=4, points=60, observers=3, noise=noise)
+    optimum = scene.adjust(iterations=50, tolerance=1e-13)
+    T = optimum.T_cw[scene.pose]
+    z = (T[:, 2, :3] * optimum.points[scene.point]).sum(dim=1) + T[:, 2, 3]
+    uv_jacobian = torch.stack([(scene.pose == 2) * CAMERA.fx / z, torch.zeros_like(z)], dim=1)
+    state = uv_jacobian, optimum.T_cw, optimum.points
+    seconds, information = estimate_readout(0.02, 1e4, *state, **scene.observations)
+    assert (float(seconds), float(information)) == (0.02, 1e4)
+    uv_jacobian[::2] = 0
+    assert estimate_readout(0.02, 1e4, *state, **scene.observations)[1] > 1e4

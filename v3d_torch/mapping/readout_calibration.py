@@ -29,6 +29,10 @@ _INFORMATION_WEIGHT = 0.1
 """Weight of the information from the curvature. Errors of depth and velocity are correlated between observations, so
 the curvature overestimates the information; 0.1 corresponds to standard deviations that are three times larger."""
 
+_MIN_CURVATURE = 1e-6
+"""Smallest curvature of a minimum, as a fraction of the curvature without adjustment of poses and points. Where these
+explain a change of the readout, rounding and the damping of their step leave a smaller one."""
+
 
 def estimate_readout(
     seconds: Tensor | float,
@@ -82,7 +86,8 @@ def estimate_readout(
     Returns:
         The new ``seconds``, with the dtype of ``T_cw``, float32 for integers, and ``information``, at least in float32,
         shape :math:`(*)` each. They equal the inputs if the readout is known, or if the cost has no minimum because the
-        camera stood still or moved uniformly.
+        camera stood still, or because other poses and landmarks explain every readout equally well. After a nearly
+        uniform motion, ``seconds`` stays nearly the same and ``information`` is discounted.
     """
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
@@ -93,14 +98,17 @@ def estimate_readout(
     derivative = -fill_padding(readout_jacobian, valid[..., None], 0.0) / sigma
     by_readout = torch.cat([derivative, torch.zeros_like(derivative[..., :1])], dim=-1).mT.expand_as(problem.scale)
     slope, curvature = reduced_cost_derivatives(*state, *problem, by_readout)
+    unadjusted = 2 * (problem.weights[..., None, :] * by_readout.square()).sum(dim=(-2, -1))
     old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
     old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
-    estimates = torch.broadcast_tensors(old_seconds, old_information, slope, curvature)
+    estimates = torch.broadcast_tensors(old_seconds, old_information, slope, curvature, unadjusted)
     new_seconds, new_information = combine_readouts(*estimates)
     return new_seconds.to(result_dtype(T_cw.dtype)), new_information.to(working_dtype(T_cw.dtype))
 
 
-def combine_readouts(seconds: Tensor, information: Tensor, slope: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+def combine_readouts(
+    seconds: Tensor, information: Tensor, slope: Tensor, curvature: Tensor, unadjusted_curvature: Tensor
+) -> tuple[Tensor, Tensor]:
     """Combine an estimate of the readout with the minimum of the cost.
 
     Args:
@@ -108,11 +116,12 @@ def combine_readouts(seconds: Tensor, information: Tensor, slope: Tensor, curvat
         information: Inverse variance of ``seconds``, 1/s^2, shape :math:`(...)`.
         slope: First derivative of the cost, twice the negative log-likelihood, by the readout, shape :math:`(...)`.
         curvature: Second derivative of the cost by the readout, shape :math:`(...)`.
+        unadjusted_curvature: Second derivative with poses and points that stay unchanged, shape :math:`(...)`.
 
     Returns:
-        Seconds and information of the combination.
+        Seconds and information of the combination; those given if the cost has no minimum.
     """
-    unchanged = information.isinf() | (curvature <= 0)
+    unchanged = information.isinf() | (curvature <= _MIN_CURVATURE * unadjusted_curvature)
     # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.
     curvature, prior_information = torch.where(unchanged, 1.0, curvature), torch.where(unchanged, 1.0, information)
     minimum = (seconds - slope / curvature).clamp(-MAX_READOUT, MAX_READOUT)
