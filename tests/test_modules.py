@@ -318,6 +318,27 @@ def test_thresholds_of_the_soft_vote_are_differentiable() -> None:
     assert dict(module.named_parameters()).keys() == {"distance_threshold", "temperature"}
 
 
+def parameter(value: float) -> torch.nn.Parameter:
+    return torch.nn.Parameter(torch.tensor(value, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("name", "module"),
+    [
+        ("soft HoughVoting", v3d.HoughVoting(parameter(0.2), 2, parameter(0.1))),
+        ("PoseRefiner", v3d.PoseRefiner(parameter(1.0), parameter(0.02), rounds=1)),
+        ("BundleAdjuster", v3d.BundleAdjuster(parameter(1.0), parameter(0.02))),
+        ("ReadoutEstimator", v3d.ReadoutEstimator(parameter(1.0), parameter(0.02))),
+        ("RollingShutterCompensation", v3d.RollingShutterCompensation(parameter(0.02), 480)),
+    ],
+)
+def test_parameters_of_modules_have_gradients(name: str, module: torch.nn.Module) -> None:
+    result = module(**CASES[name].inputs(1, 30, torch.float64))
+    result[0].sum().backward()
+    for each_parameter in module.parameters():
+        assert each_parameter.grad is not None and each_parameter.grad.isfinite() and each_parameter.grad != 0
+
+
 def test_gradients_flow_from_pixels_to_votes() -> None:
     """Depth of two frames is smoothed, back-projected and pooled; clouds are compared, and centroids vote."""
     depth = torch.stack([image(1, 0, torch.float64)["depth"][0], image(2, 0, torch.float64)["depth"][1]])

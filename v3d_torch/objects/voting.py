@@ -123,7 +123,7 @@ def vote_with_free_space(
 
 
 class HoughVoting(torch.nn.Module):
-    """:func:`hough_vote` as a module. A parameter given as a `torch.nn.Parameter` can be learned.
+    """:func:`hough_vote` as a module. Distance threshold and temperature can be a `torch.nn.Parameter` that is learned.
 
     Args:
         distance_threshold: Minimum change of a distance that counts as a vote, metres.
