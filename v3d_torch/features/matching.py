@@ -116,7 +116,8 @@ def match_descriptors(
     second = distance.scatter(-1, nearest[..., None], never).amin(dim=-1)
     row = torch.arange(a.shape[-2], device=a.device)
     mutual = distance.argmin(dim=-2).gather(-1, nearest) == row
-    accepted = mutual & (best <= max_hamming) & (best < max_ratio * second) & enough[..., None]
+    # Padding is never nearest, however large the thresholds are.
+    accepted = mutual & (best < never) & (best <= max_hamming) & (best < max_ratio * second) & enough[..., None]
     return torch.where(accepted, nearest, -1)
 
 
