@@ -58,6 +58,15 @@ def test_pose_does_not_depend_on_the_dtype_of_the_initial_guess(dtype: torch.dty
     assert found.T_cw.dtype == torch.float64 and torch.equal(found.T_cw, expected.T_cw)
 
 
+@pytest.mark.parametrize("scale", [1.0, -1.0, 0.0, torch.nan])
+def test_initial_guess_without_inliers_is_no_pose(scale: float) -> None:
+    """All points are at one place, before or behind the camera, or nowhere, but their pixels are not."""
+    uv = 400 * torch.rand(50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points, identity = torch.full((50, 3), scale, dtype=torch.float64), torch.eye(4, dtype=torch.float64)
+    found = pnp_ransac(points, uv, CAMERA.K, identity)
+    assert not found.found and not found.inliers.any() and torch.equal(found.T_cw, identity)
+
+
 def test_wrong_initial_guess_does_not_change_the_result() -> None:
     a, b, T_ba = two_views(outliers=100)
     points = CAMERA.back_project(a.uv, a.depth)

@@ -60,7 +60,7 @@ class PnP(NamedTuple):
     Attributes:
         T_cw: World-to-camera poses, shape :math:`(*, 4, 4)`; the identity if no pose was found.
         inliers: Mask of the points that agree with the pose, bool, shape :math:`(*, N)`.
-        found: True if a pose was found, bool, shape :math:`(*)`.
+        found: True if a pose was found that agrees with at least one point, bool, shape :math:`(*)`.
     """
 
     T_cw: Tensor
@@ -140,7 +140,7 @@ def pnp_ransac(
         # Only pixels have residuals; the measured depth is already part of the points.
         weights = consensus.to(torch.float64)
         refined = refine_pose(hypothesis, points, uv, K, None, sigma, weights=weights, valid=valid, rounds=2)
-        is_new = exists & ~done
+        is_new = exists & ~done & refined.inliers.any(dim=-1)
         T_cw, inliers = select(is_new, (refined.T_cw.to(dtype), refined.inliers), (T_cw, inliers))
         found = found | is_new
         done = done | (is_new & (2 * inliers.sum(dim=-1) > count))
