@@ -50,6 +50,15 @@ def test_pooling_equals_group_by(dtype: torch.dtype, count: int) -> None:
     assert voxels.means.shape[1] == voxels.valid.sum(dim=1).max()
 
 
+@pytest.mark.parametrize("with_gradient", [False, True], ids=["kernel", "torch"])
+def test_mean_of_many_equal_points_is_the_point(with_gradient: bool) -> None:
+    point = torch.tensor([0.1, -0.7, 3.3])
+    points = point.repeat(1, 1_000_000, 1).requires_grad_(with_gradient)
+    voxels = voxel_pool(points, torch.ones(1, 1_000_000, dtype=torch.bool), 0.05)
+    assert voxels.counts.tolist() == [[1_000_000]] and voxels.means.dtype == torch.float32
+    assert torch.equal(voxels.means[0, 0], point)
+
+
 @settings(max_examples=60)
 @given(
     cloud=st.lists(st.tuples(*[st.integers(-40, 40)] * 3), max_size=300),

@@ -22,7 +22,8 @@ class Voxels(NamedTuple):
     """Occupied voxels of a batch of clouds, sorted by x, then y, then z, with padding at the end.
 
     Attributes:
-        means: Mean of the points in each voxel, metres, shape :math:`(B, M, 3)`; 0 in the padding.
+        means: Mean of the points in each voxel, metres, shape :math:`(B, M, 3)`; 0 in the padding. Sums are
+            in double precision, results in the dtype of the points.
         valid: Mask of the voxels that are not padding, bool, shape :math:`(B, M)`.
         counts: Number of points in each voxel, int64, shape :math:`(B, M)`; 0 in the padding.
         voxel_index: Index of each point's voxel within its cloud, int64, shape :math:`(B, N)`; -1 for invalid points.
@@ -75,14 +76,15 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
     if not size > 0:  # also if it is NaN
         raise ConfigError(f"the voxel size is {size} m; give a positive number")
-    wide = points.to(working_dtype(points.dtype))
-    voxel_index, occupied = _number_voxels(wide.detach(), valid, size)
+    voxel_index, occupied = _number_voxels(points.detach().to(working_dtype(points.dtype)), valid, size)
     batch, count = valid.shape
     voxels = count if not can_read(occupied) else int(occupied.max()) if batch else 0
     # Row 0 of each cloud collects its padding and is dropped. The axes are summed one by one, because torch would
-    # spread the rows of a matrix over threads, which takes longer than the sum.
+    # spread the rows of a matrix over threads, which takes longer than the sum. Sums of many points in single precision
+    # would lose digits.
     slot = voxel_index + 1
-    sums = [axis.new_zeros(batch, voxels + 1).scatter_add(1, slot, axis) for axis in wide.unbind(dim=2)]
+    axes = points.to(torch.float64).unbind(dim=2)
+    sums = [axis.new_zeros(batch, voxels + 1).scatter_add(1, slot, axis) for axis in axes]
     counts = slot.new_zeros(batch, voxels + 1).scatter_add(1, slot, valid.to(torch.int64))[:, 1:]
     means = torch.stack(sums, dim=2)[:, 1:] / counts.clamp(min=1)[..., None]
     return Voxels(means.to(points.dtype), counts > 0, counts, voxel_index)

@@ -32,10 +32,10 @@ def pool_voxels(points: Points, size: np.float32, max_voxels: float) -> tuple[Po
             cell = np.float64(np.floor(points[i, axis] / size))
             finite &= np.isfinite(cell)
             cells[i, axis], low[axis], high[axis] = cell, min(low[axis], cell), max(high[axis], cell)
-    means, sizes, voxels = np.zeros((count, 3), np.float32), np.zeros(count, np.int64), np.empty(count, np.int64)
+    sums, sizes, voxels = np.zeros((count, 3)), np.zeros(count, np.int64), np.empty(count, np.int64)
     sides = high - low + 1
     if count == 0 or not finite or not sides[0] * sides[1] * sides[2] < max_voxels:
-        return means[:0], sizes[:0], voxels
+        return np.empty((0, 3), np.float32), sizes[:0], voxels
     keys, (side_y, side_z) = np.empty(count, np.int64), (np.int64(sides[1]), np.int64(sides[2]))
     for i in range(count):
         x, y, z = cells[i, 0] - low[0], cells[i, 1] - low[1], cells[i, 2] - low[2]
@@ -46,8 +46,9 @@ def pool_voxels(points: Points, size: np.float32, max_voxels: float) -> tuple[Po
         last, voxels[i] = keys[i], voxel
         sizes[voxel] += 1
         for axis in range(3):
-            means[voxel, axis] += points[i, axis]
+            sums[voxel, axis] += points[i, axis]
+    means = np.empty((voxel + 1, 3), np.float32)
     for k in range(voxel + 1):
         for axis in range(3):
-            means[k, axis] /= np.float32(sizes[k])
-    return means[: voxel + 1], sizes[: voxel + 1], voxels
+            means[k, axis] = sums[k, axis] / sizes[k]
+    return means, sizes[: voxel + 1], voxels
