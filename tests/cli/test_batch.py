@@ -30,6 +30,7 @@ from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.cli.batch import app
 from v3d_torch.config.loading import load_config
+from v3d_torch.runs.result_folder import lock_results
 
 BROKEN_AT = 3
 """Index of the damaged image."""
@@ -229,6 +230,15 @@ def test_tables_keep_the_runs_of_an_earlier_batch(
         result = call(*arguments, "--configs", "baseline", "--out", out)
         assert_error_line(result, f"{out}: the tables have runs of other sequences", "such as good/few/seed0; give")
     assert {path: path.read_bytes() for path in out.glob("*.*")} == before and not (out / "other").exists()
+
+
+def test_folder_to_which_another_batch_writes_is_error(moment: Path, tmp_path: Path) -> None:
+    arguments = ("--seqs", moment, "--configs", "baseline", "--out", tmp_path / "out")
+    with lock_results(tmp_path / "out"):
+        for resume in ((), ("--resume",)):
+            result = call(*arguments, *resume)
+            assert_error_line(result, f"{tmp_path / 'out'}: another run or batch is writing to this folder")
+        assert files_in(tmp_path / "out") == {".run.lock"}
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from v3d_torch.datasets import PAPER_SEQUENCES, locate, short_name
 from v3d_torch.datasets.tum_extents import EXTENTS
 from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.evaluation.paper_tables import load_paper_scores
+from v3d_torch.runs.result_folder import lock_results
 
 SHORT = [short_name(name) for name in PAPER_SEQUENCES]
 SERVED = [name for name in PAPER_SEQUENCES if name.endswith(("walking_xyz", "sitting_rpy"))]
@@ -226,6 +227,13 @@ def test_runs_use_configurations_of_the_package(server: str, fake_runs: list[str
     for config in reproduction.TABLE_CONFIGS:
         folder = tmp_path / "out" / "fr3_w_xyz" / config / "seed0"
         assert load_config(folder / "config.yaml") == load_config(CONFIGS[config])
+
+
+def test_folder_to_which_a_batch_writes_is_error(server: str, fake_runs: list[str], tmp_path: Path) -> None:
+    with lock_results(tmp_path / "out"):
+        result = call("--data-root", tmp_path / "data", "--out", tmp_path / "out", "--resume")
+    assert_error_line(result, f"{tmp_path / 'out'}: another run or batch is writing to this folder")
+    assert not fake_runs
 
 
 # --- bad input

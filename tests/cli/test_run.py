@@ -114,7 +114,7 @@ def test_folder_to_which_another_run_writes_is_an_error_and_stays(sequence: Path
         for name in ("run.log", "metrics.json"):
             (tmp_path / "out" / name).write_text("of the other run")
         done = call_here("--seq", sequence, "--segmenter", "none", "--out", "out", cwd=tmp_path)
-        assert_error_line(done, "out: another run is writing to this folder")
+        assert_error_line(done, "out: another run or batch is writing to this folder")
         assert {(tmp_path / "out" / name).read_text() for name in ("run.log", "metrics.json")} == {"of the other run"}
 
 

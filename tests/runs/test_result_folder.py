@@ -65,7 +65,7 @@ def test_folder_of_another_run_cannot_be_locked_until_that_run_ends_or_is_killed
         ) as other:
             assert other.stdout is not None and other.stdout.readline() == "locked\n"
             with (
-                pytest.raises(OutputError, match=r"out: another run is writing to this folder; wait .* --out$"),
+                pytest.raises(OutputError, match=r"out: another run or batch is writing to this folder; wait .*--out$"),
                 result_folder.lock_results(folder),
             ):
                 pass

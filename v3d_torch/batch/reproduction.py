@@ -32,7 +32,7 @@ from v3d_torch.evaluation.summary import (
 from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_table
 from v3d_torch.io.files import write_text
 from v3d_torch.runs.open_sequences import open_sequence
-from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.result_folder import lock_results, make_result_folder
 
 TABLE_CONFIGS = (FULL, "paper", "baseline")
 """Default configurations in the paper's tables."""
@@ -70,10 +70,10 @@ def run_reproduction(
     folder = make_result_folder(out, "reproduce")
     sequences = {name: (name, sequence) for name, sequence in opened.items()}
     jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder)
-    record = ReproductionRecord(
-        jobs, folder.absolute(), list(table_configs), list(map(short_name, missing)), study=study
-    )
-    run_missing_jobs(record, ProcessExecutor(workers or 1), console, resume=resume)
+    absent = list(map(short_name, missing))
+    with lock_results(folder):
+        record = ReproductionRecord(jobs, folder.absolute(), list(table_configs), absent, study=study)
+        run_missing_jobs(record, ProcessExecutor(workers or 1), console, resume=resume)
 
 
 class ReproductionRecord(BatchRecord):

@@ -21,7 +21,7 @@ from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.progress_bar import progress_bars
-from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.result_folder import lock_results, make_result_folder
 
 
 def run_batch(
@@ -52,7 +52,8 @@ def run_batch(
     prepare_stages(configs)
     folder = make_result_folder(out, "batch")
     jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder, skip_broken=skip_broken)
-    run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume)
+    with lock_results(folder):
+        run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume)
 
 
 def check_resume(resume: bool, out: Path | None) -> None:

@@ -40,7 +40,7 @@ def run_with_progress(
         The pipeline that ran, and the scores if there is ground truth.
 
     Raises:
-        OutputError: If another run is writing to the folder, or the results cannot be written.
+        OutputError: If another run or batch is writing to the folder, or the results cannot be written.
     """
     with lock_results(folder):
         if checkpoint is None:

@@ -18,7 +18,7 @@ _LOG = "run.log"
 """Name of the log, which every run writes first: a folder with this file contains results of a run."""
 
 _LOCK = ".run.lock"
-"""Name of the lock file, which exists while a run writes."""
+"""Name of the lock file, which exists while a run or a batch writes."""
 
 _NO_LOCKS = (ENOLCK, ENOSYS, EOPNOTSUPP)
 """Error numbers of file systems without locks."""
@@ -82,12 +82,12 @@ def _make_folder_by_time(runs: Path) -> Path:
 
 @contextmanager
 def lock_results(folder: Path) -> Iterator[None]:
-    """Keep other runs from writing to a folder, which is made if it is missing, until the end of the block.
+    """Keep other runs and batches from writing to a folder, which is made if it is missing, until the end of the block.
 
     The lock of a process that is killed ends with it. On a file system without locks, nothing is locked.
 
     Raises:
-        OutputError: If another run is writing to the folder, or if it cannot be written.
+        OutputError: If another run or batch is writing to the folder, or if it cannot be written.
     """
     lock = FileLock(folder / _LOCK)
     try:
@@ -95,7 +95,8 @@ def lock_results(folder: Path) -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout as error:
         raise OutputError(
-            f"{folder}: another run is writing to this folder; wait until it ends, or choose another folder with --out"
+            f"{folder}: another run or batch is writing to this folder; wait until it ends, or choose another folder"
+            " with --out"
         ) from error
     except NotImplementedError:  # older versions of filelock raise it for ENOSYS
         pass
