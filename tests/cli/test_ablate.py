@@ -165,6 +165,23 @@ def test_file_in_place_of_result_folder_is_error(sequence: Path, tmp_path: Path)
     assert_error_line(call(*arguments), str(tmp_path / "taken"))
 
 
+def test_folder_of_an_earlier_study_is_an_error(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = FakeRuns(RuntimeError(), at=99)
+    monkeypatch.setattr(ablation_study, "Run", runs)
+    monkeypatch.chdir(tmp_path)
+    arguments = ("--seq", sequence, "--seeds", "1", "--variants")
+    assert call(*arguments, "baseline", "--out", "out").exit_code == 0
+    tables = {path: path.read_bytes() for path in Path("out").glob("ablation.*")}
+    result = call(*arguments, "full", "--out", "out")
+    assert_error_line(result, "out: contains an earlier study; choose another folder with --out")
+    assert {path: path.read_bytes() for path in Path("out").glob("ablation.*")} == tables and len(runs.seeds) == 1
+    for count in (2, 3):  # without --out, each study has a folder of its own
+        assert call(*arguments, "baseline").exit_code == 0
+        assert len(runs.seeds) == count
+
+
 def test_zero_seeds_are_rejected(sequence: Path) -> None:
     assert call("--seq", sequence, "--seeds", "0").exit_code == 2
 

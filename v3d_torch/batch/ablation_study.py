@@ -36,6 +36,9 @@ from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_instance_source, make_segmenter, wrap_upright
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
+_TABLE = "ablation.csv"
+"""Name of the table with all values, which every study writes after its first run."""
+
 _NOTE = (
     "Variants with the same input of the network shared its results, and all runs shared one process: times and memory"
     " in their metrics.json are not those of a single run."
@@ -79,8 +82,8 @@ def run_ablation_study(
     """Run the study, show and write its tables; arguments as in ``v3d-torch ablate --help``.
 
     Raises:
-        V3DError: If the input is invalid, if the study was interrupted, or if a run failed. The results of the other
-            runs are written.
+        V3DError: If the input is invalid, if the folder contains an earlier study, if the study was interrupted, or if
+            a run failed. The results of the other runs are written.
     """
     console = wide_console()
     configs = {
@@ -97,6 +100,8 @@ def run_ablation_study(
         else:
             make_segmenter(config, camera)
     folder = make_result_folder(out, "ablation")
+    if (folder / _TABLE).exists():
+        raise InputError(f"{folder}: contains an earlier study; choose another folder with --out")
     outcomes: list[Outcome] = []
     try:
         for name, sequence in sequences.items():
@@ -112,7 +117,7 @@ def run_ablation_study(
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 console.print(str(outcomes[-1]), markup=False)
                 write_text(folder / "ablation.md", format_markdown(outcomes, _NOTE))
-                write_text(folder / "ablation.csv", format_csv(outcomes))
+                write_text(folder / _TABLE, format_csv(outcomes))
             console.print(make_screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
     except KeyboardInterrupt as interrupt:
         done, total = len(outcomes), len(configs) * len(sequences)
