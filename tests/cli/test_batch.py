@@ -19,6 +19,7 @@ import numpy as np
 import pandas as pd
 import psutil
 import pytest
+import yaml
 from helpers.batches import plan_seeds, repeat_sequence
 from helpers.commands import RUN_FILES, assert_error_line, files_in
 from typer.testing import CliRunner, Result
@@ -152,6 +153,22 @@ def test_summaries_match_metrics_of_runs(done: Result, work: Path) -> None:
     rows = list(csv.DictReader((work / "out" / "summary.csv").open(newline="")))
     medians = {row["method"]: row["median"] for row in rows if (row["metric"], row["sequence"]) == ("ate.rmse", "good")}
     assert {config: float(value) for config, value in medians.items()} == ates
+
+
+def test_warnings_of_a_run_are_on_the_console_and_in_the_tables(moment: Path, tmp_path: Path) -> None:
+    sequence, out = shutil.copytree(moment, tmp_path / "small"), tmp_path / "out"
+    camera = yaml.safe_load((sequence / "camera.yaml").read_text())
+    (sequence / "camera.yaml").write_text(yaml.safe_dump(camera | {"depth_scale": camera["depth_scale"] * 20}))
+    result = call("--seqs", sequence, moment, "--configs", "baseline", "--out", out)
+    assert result.exit_code == 0, result.output
+    (warning,) = metrics_of(out / "small" / "baseline" / "seed0")["warnings"]
+    assert "depth_scale" in warning
+    lines = result.stdout.splitlines()
+    assert [line for line in lines if line.startswith("warning: ")] == [f"warning: {warning}"]
+    assert lines[lines.index(f"warning: {warning}") - 1].startswith("small, baseline, seed 0: ")
+    document = (out / "summary.md").read_text()
+    assert document.endswith(f"## Warnings\n\n- small, baseline, seed 0: {warning}\n")
+    assert pd.read_parquet(out / "runs.parquet")["warnings"].tolist() == [warning, ""]
 
 
 # --- resume

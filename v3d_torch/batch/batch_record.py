@@ -37,6 +37,7 @@ _SCHEMA = pa.schema(
         ("seed", pa.int64()),
         *((key.replace(".", "_"), data_type) for key, data_type in METRIC_TYPES.items()),
         ("difference", pa.string()),
+        ("warnings", pa.string()),
         ("failure", pa.string()),
         ("path", pa.string()),
     ]
@@ -132,6 +133,7 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         "seed": outcome.seed,
         **{key.replace(".", "_"): outcome.get_metric(key) for key in METRIC_TYPES},
         "difference": outcome.difference,
+        "warnings": "\n".join(outcome.warnings),
         "failure": outcome.failure,
         "path": _relative_path(job, folder),
     }

@@ -123,7 +123,9 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                     if isinstance(event, JobRepeated):
                         progress.console.print(str(event), markup=False)
                     if isinstance(event, JobFinished):
-                        progress.console.print(str(record.add(event)), markup=False)
+                        outcome = record.add(event)
+                        warnings = [f"warning: {warning}" for warning in outcome.warnings]
+                        progress.console.print(str(outcome), *warnings, sep="\n", markup=False)
                         progress.table = next(iter(record.screen_tables()), None)
                         try:
                             record.write()

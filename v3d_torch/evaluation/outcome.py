@@ -26,6 +26,16 @@ class Outcome:
     failure: str | None = None
 
     @property
+    def run(self) -> str:
+        """Sequence, configuration and seed, which name the run in texts."""
+        return f"{self.sequence}, {self.config}, seed {self.seed}"
+
+    @property
+    def warnings(self) -> list[str]:
+        """Contradictions between the images and the camera, one sentence each; empty for a failed run."""
+        return list(self.metrics.get("warnings", ()))
+
+    @property
     def difference(self) -> str | None:
         """Description of the difference to the sequence of the benchmark with this name; None if there is none."""
         difference: str | None = self.metrics.get("difference")
@@ -46,7 +56,7 @@ class Outcome:
         if skipped := self.get_metric("skipped"):
             score += f", {skipped:.0f} broken frame{'s' if skipped > 1 else ''} skipped"
         result = score if self.failure is None else f"failed: {self.failure}"
-        return f"{self.sequence}, {self.config}, seed {self.seed}: {result}"
+        return f"{self.run}: {result}"
 
 
 def find_difference(outcomes: Iterable[Outcome], sequence: str) -> str | None:

@@ -74,7 +74,7 @@ def make_ratio_tables(outcomes: Sequence[Outcome]) -> list[ErrorTable]:
 
 
 def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return a Markdown document with all tables and the runs that failed.
+    """Return a Markdown document with all tables, the warnings of the runs, and the runs that failed.
 
     See `make_error_tables` and `make_ratio_tables`.
     """
@@ -86,6 +86,8 @@ def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> 
     if ratios := make_ratio_tables(outcomes):
         lines += [line for table in ratios for line in format_markdown_table(table)]
         lines += ["", RATIO_LEGEND]
+    warnings = [f"- {outcome.run}: {warning}" for outcome in outcomes for warning in outcome.warnings]
+    lines += ["", "## Warnings", "", *warnings] if warnings else []
     failed = [f"- {outcome}" for outcome in outcomes if outcome.failure is not None]
     lines += ["", "## Failed", "", *failed] if failed else []
     return "\n".join(lines) + "\n"
