@@ -155,7 +155,7 @@ def test_bad_input_is_one_line_before_first_run(
 def test_sequences_with_same_name_are_rejected(sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "moment").symlink_to(sequence)
     result = call("--seq", sequence, "--seq", tmp_path / "moment", "--out", tmp_path / "out")
-    assert_error_line(result, "moment: another sequence has the same name", "run them separately")
+    assert_error_line(result, f"moment: {sequence} has the same name, moment", "run them separately")
     assert not (tmp_path / "out").exists()
 
 

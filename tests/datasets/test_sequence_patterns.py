@@ -91,6 +91,18 @@ def test_sequence_with_several_names_matches_once(root: Path) -> None:
     assert matching_sequences(["fr?_xyz"], root) == ["fr1_xyz", "fr2/xyz"]  # fr1_xyz is a folder in the data root
 
 
+def test_spellings_of_one_folder_match_once(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root)
+    (root.parent / "link").symlink_to(root / "sit")
+    for patterns in (
+        ["sit", "./sit", str(root / "sit"), "../link", "s?t"],
+        [str(root / "rgbd_dataset_freiburg1_rpy"), "fr1/rpy", "freiburg1-rpy"],
+    ):
+        assert matching_sequences(patterns, root) == patterns[:1]
+    (root / "demo").mkdir()
+    assert matching_sequences(["demo", "./demo"], root) == ["demo", "./demo"]  # the rendered demo, and a folder
+
+
 def test_folder_with_a_common_name_is_not_a_sequence_of_the_benchmark(root: Path) -> None:
     assert matching_sequences(["room", "fr1/room"], root) == ["room", "fr1/room"]
 

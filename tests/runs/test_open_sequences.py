@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -37,3 +38,11 @@ def test_memory_for_large_images_is_stated(width: int, height: int, gigabytes: i
         " and camera file down if there is less\n"
     )
     assert output.getvalue() == ("" if gigabytes is None else expected)
+
+
+def test_two_sequences_with_the_same_name_are_rejected(tmp_path: Path) -> None:
+    first, second = (tmp_path / place / "seq" for place in ("home", "lab"))
+    for folder in (first, second):
+        write_base(folder)
+    with pytest.raises(InputError, match=re.escape(f"{second}: {first} has the same name, seq; run them separately")):
+        open_sequences([str(first), str(second)], None, Console())

@@ -89,6 +89,20 @@ def find_stored(name: str, data_root: Path | None) -> Path | None:
     return next((path for path in found if path is not None), None)
 
 
+def identify(name: str, data_root: Path | None) -> Path | str:
+    """Return what all spellings of one sequence have in common: its path if it is on disk, or else its full name.
+
+    Args:
+        name: Name as in `open_source`.
+        data_root: Folder with the user's sequences; None for ``$V3D_DATA``.
+
+    Raises:
+        OSError: If the name is too long, or if a folder cannot be read.
+    """
+    stored = None if _is_special(name) else find_stored(name, data_root)
+    return stored.resolve() if stored is not None else canonical_name(name) or name
+
+
 def data_folder(data_root: Path | None) -> Path:
     """Folder with the user's sequences: ``data_root`` if given, or else ``$V3D_DATA``, or else the cache."""
     shared = os.environ.get("V3D_DATA")

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from v3d_torch.datasets.locate import data_folder
-from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, canonical_name, short_name
+from v3d_torch.datasets.locate import data_folder, identify
+from v3d_torch.datasets.sequence_names import PAPER_SEQUENCES, SEQUENCES, short_name
 from v3d_torch.datasets.sources import is_source
 from v3d_torch.errors import InputError
 
@@ -32,20 +32,19 @@ def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -
         data_root: Folder with the user's sequences; None for ``$V3D_DATA``, or else the cache.
 
     Returns:
-        Sequences without duplicates, in the order of the patterns. The matches of a pattern are ordered as above: paths
-        and entries of ``data_root`` alphabetically, benchmark names with those of the paper first.
+        Sequences in the order of the patterns, each once, in its first spelling. The matches of a pattern are ordered
+        as above: paths and entries of ``data_root`` alphabetically, benchmark names with those of the paper first.
 
     Raises:
         InputError: If a pattern has no matches.
     """
-    found: dict[str, str] = {}
+    found: dict[Path | str, str] = {}
     for pattern in patterns:
         try:
-            names = _match(pattern, data_folder(data_root))
+            for name in _match(pattern, data_folder(data_root)):
+                found.setdefault(identify(name, data_root), name)
         except (OSError, RuntimeError, ValueError) as error:  # name too long, unknown user after ~, ** within a name
             raise InputError(f"{pattern}: is not a valid pattern ({error}); check the path") from error
-        for name in names:
-            found.setdefault(canonical_name(name) or name, name)
     return list(found.values())
 
 

@@ -66,10 +66,11 @@ def open_sequences(
         DownloadError: If a sequence is missing and cannot be downloaded.
     """
     sequences: dict[str, RGBDSequence] = {}
+    sources: dict[str, str] = {}
     for name in dict.fromkeys(names):
         sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
         check_groundtruth(sequence)  # runs are compared by their scores
-        if sequence.name in sequences:
-            raise InputError(f"{name}: another sequence has the same name, {sequence.name}; run them separately")
+        if (other := sources.setdefault(sequence.name, name)) != name:
+            raise InputError(f"{name}: {other} has the same name, {sequence.name}; run them separately")
         sequences[sequence.name] = sequence
     return sequences
