@@ -92,7 +92,16 @@ def test_fewer_than_three_associated_poses_are_rejected() -> None:
     elsewhere = Trajectory(groundtruth.stamps + 100, groundtruth.T_wc)
     empty = Trajectory(groundtruth.stamps[:0], groundtruth.T_wc[:0])
     for estimate in (elsewhere, empty, Trajectory(groundtruth.stamps[:2], groundtruth.T_wc[:2])):
-        with pytest.raises(InputError, match="at least 3 are needed"):
+        with pytest.raises(InputError, match="at least 3 are needed; check that both belong to the same sequence"):
+            evaluate(groundtruth, estimate)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
+def test_timestamps_in_another_unit_are_named(factor: float, unit: str) -> None:
+    seconds = random_walk(60, seed=18)
+    counts = Trajectory(seconds.stamps * factor, seconds.T_wc)
+    for groundtruth, estimate, name in ((seconds, counts, "estimate"), (counts, seconds, "ground truth")):
+        with pytest.raises(InputError, match=f"needed; the timestamps of the {name} seem to be in {unit}, write them"):
             evaluate(groundtruth, estimate)
 
 

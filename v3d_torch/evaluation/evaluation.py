@@ -17,6 +17,12 @@ from v3d_torch.types import Trajectory
 MIN_PAIRS = 3
 """Minimum number of associated poses: three positions determine a rigid alignment."""
 
+_UNITS = {10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}
+"""Units of timestamps by their number in a second."""
+
+_UNIT_TOLERANCE = 2.0
+"""Maximum ratio of the durations of two trajectories of one sequence, of which one can be a part."""
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -88,8 +94,8 @@ def evaluate(
     if len(matches) < MIN_PAIRS:
         raise InputError(
             f"only {len(matches)} poses of the estimate {_time_range(estimate)} are within {max_time_difference:g} s of"
-            f" the ground truth {_time_range(groundtruth)}, at least {MIN_PAIRS} are needed; check that both belong to"
-            " the same sequence"
+            f" the ground truth {_time_range(groundtruth)}, at least {MIN_PAIRS} are needed;"
+            f" {_suggest(_duration(groundtruth), _duration(estimate))}"
         )
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
     oriented = has_orientations(groundtruth)
@@ -126,6 +132,22 @@ def has_orientations(trajectory: Trajectory) -> bool:
     turns = not torch.allclose(T_wc[:, :3, :3], T_wc[:1, :3, :3], rtol=0, atol=1e-9)
     moves = not torch.allclose(T_wc[:, :3, 3], T_wc[:1, :3, 3], rtol=0, atol=1e-9)
     return turns or not moves
+
+
+def _suggest(true: float, estimated: float) -> str:
+    """Return what to do if hardly any poses are associated, from the durations of ground truth and estimate."""
+    if min(true, estimated) > 0:
+        ratio = max(true, estimated) / min(true, estimated)
+        for factor, unit in _UNITS.items():
+            if factor / _UNIT_TOLERANCE < ratio < factor * _UNIT_TOLERANCE:
+                name = "estimate" if estimated > true else "ground truth"
+                return f"the timestamps of the {name} seem to be in {unit}, write them in seconds"
+    return "check that both belong to the same sequence"
+
+
+def _duration(trajectory: Trajectory) -> float:
+    """Return the time from the first to the last pose in the unit of the timestamps; 0 without poses."""
+    return float(trajectory.stamps[-1] - trajectory.stamps[0]) if len(trajectory) else 0.0
 
 
 def _time_range(trajectory: Trajectory) -> str:
