@@ -18,11 +18,13 @@ from v3d_torch.io.parquet_file import write_parquet
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
-    **dict.fromkeys(("frames", "processed", "skipped", *TrackingStatus, "keyframes", "loops"), pa.int64()),
+    **dict.fromkeys(("frames", "processed", "skipped", *TrackingStatus, "pairs"), pa.int64()),
+    **dict.fromkeys(("keyframes", "landmarks", "loops"), pa.int64()),
     **dict.fromkeys(("coverage", "ate.rmse", "ate.std"), pa.float64()),
     **dict.fromkeys(("rpe.trans.rmse", "rpe.trans.std", "rpe.rot.rmse", "rpe.rot.std"), pa.float64()),
     **dict.fromkeys(("masks.moving_masked", "masks.static_masked"), pa.float64()),
     **dict.fromkeys(("masks.id_switches_per_60_frames", "masks.people_found"), pa.float64()),
+    **dict.fromkeys(("readout", "readout_sigma"), pa.float64()),
     **dict.fromkeys(("fps", "seconds", "peak_memory_mb"), pa.float64()),
 }
 """Metrics in ``runs.parquet`` by their key in ``metrics.json``, and their types.
