@@ -236,6 +236,46 @@ def test_finished_runs_are_not_overwritten(repaired: tuple[Path, Result, dict[Pa
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
+@pytest.fixture
+def mended(repaired: tuple[Path, Result, dict[Path, int]], tmp_path: Path) -> tuple[Path, list[str | Path]]:
+    """Copy of a sequence and of its finished run, and the arguments that resume the batch."""
+    data, out = tmp_path / "moved" / "good", tmp_path / "out"
+    shutil.copytree(repaired[0] / "data" / "good", data)
+    shutil.copytree(repaired[0] / "out" / "good", out / "good")
+    return data, ["--seqs", data, "--configs", "baseline", "--out", out, "--resume"]
+
+
+def test_finished_run_of_a_moved_sequence_is_kept(mended: tuple[Path, list[str | Path]]) -> None:
+    result = call(*mended[1])
+    assert result.exit_code == 0 and ", seed" not in result.stdout, result.output
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after"),
+    [
+        ("camera.yaml", "depth_scale: ", "depth_scale: 1"),
+        ("groundtruth.txt", " -0.137705860 ", " -0.237705860 "),
+        ("associations.txt", "2.733333 rgb/", "2.730000 rgb/"),
+    ],
+)
+def test_finished_run_of_another_recording_or_camera_is_not_kept(
+    name: str, before: str, after: str, mended: tuple[Path, list[str | Path]]
+) -> None:
+    data, arguments = mended
+    text = (data / name).read_text()
+    assert before in text
+    (data / name).write_text(text.replace(before, after, 1))
+    folder = data.parents[1] / "out" / "good" / "baseline" / "seed0"
+    written = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    assert_error_line(call(*arguments), f"{folder}: contains a finished run with another camera", data)
+    assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == written
+
+    metrics = metrics_of(folder)
+    del metrics["sequence_digest"]  # as an earlier version wrote it
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    assert call(*arguments).exit_code == 0
+
+
 def test_tables_keep_the_runs_of_an_earlier_batch(
     repaired: tuple[Path, Result, dict[Path, int]], tmp_path: Path
 ) -> None:

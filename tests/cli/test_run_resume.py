@@ -477,7 +477,7 @@ def test_interrupted_run_of_a_batch_resumes(sequence: Path, tmp_path: Path) -> N
     config = load_config(overrides=["segmentation.source=none", "prefetch=false"])
 
     def job(name: str, config: Config = config) -> Job:
-        return Job("seq", str(sequence), FRAMES, None, "own", config, tmp_path / name)
+        return Job("seq", str(sequence), FRAMES, "", None, "own", config, tmp_path / name)
 
     def stop(count: int) -> None:
         if count == 6:

@@ -54,7 +54,7 @@ class BatchRecord:
         folder: Folder of the results.
 
     Raises:
-        InputError: If a complete run in the folder has another configuration.
+        InputError: If a complete run in the folder has another configuration or another sequence.
     """
 
     def __init__(self, jobs: Sequence[Job], folder: Path) -> None:

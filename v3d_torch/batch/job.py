@@ -22,6 +22,7 @@ class Job:
         sequence: Name of the sequence in tables.
         source: Path or name of the sequence, see `load_sequence`.
         frames: Number of frames of the sequence.
+        digest: Digest of the sequence, see `sequence_digest`.
         data_root: Folder of named sequences.
         config_name: Name of the configuration in tables.
         config: Configuration of the run, including its seed.
@@ -32,6 +33,7 @@ class Job:
     sequence: str
     source: str
     frames: int
+    digest: str
     data_root: Path | None
     config_name: str
     config: Config
@@ -59,7 +61,7 @@ class Job:
         """Return the outcome of an earlier, complete run in the folder; None if there is no such run.
 
         Raises:
-            InputError: If the earlier run had another configuration.
+            InputError: If the earlier run had another configuration, or another sequence of the same length.
         """
         metrics = self._read_metrics()
         if metrics is None or metrics.get("failure") is not None:
@@ -74,6 +76,11 @@ class Job:
             raise InputError(
                 f"{self.folder}: contains a finished run with other values than those of {self.config_name}; choose"
                 " another folder with --out, or delete this one to run it again"
+            )
+        if metrics.get("sequence_digest", self.digest) != self.digest:  # earlier versions stored no digest
+            raise InputError(
+                f"{self.folder}: contains a finished run with another camera, other timestamps or another ground truth"
+                f" than {self.source} has; choose another folder with --out, or delete this one to run it again"
             )
         return self.make_outcome(None)
 

@@ -10,6 +10,7 @@ from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.locate import data_root_of
+from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import ConfigError
 from v3d_torch.io.paths import expand_user, folder_name
 from v3d_torch.runtime.stage_import import import_stage
@@ -79,6 +80,7 @@ def plan_jobs(
             sequence=name,
             source=str(path.absolute()) if (path := expand_user(source)).exists() else source,
             frames=len(sequence),
+            digest=digest,
             data_root=data_root_of(source, data_root),  # other machines may lack the variable
             config_name=label,
             config=config.model_copy(update={"seed": seed}),
@@ -86,6 +88,7 @@ def plan_jobs(
             skip_broken=skip_broken,
         )
         for name, (source, sequence) in sequences.items()
+        for digest in [sequence_digest(sequence)]
         for label, config in configs.items()
         for seed in range(seeds)
     ]

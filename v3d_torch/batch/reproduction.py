@@ -87,7 +87,7 @@ class ReproductionRecord(BatchRecord):
         study: True to include the ablation study.
 
     Raises:
-        InputError: If a complete run in the folder has another configuration.
+        InputError: If a complete run in the folder has another configuration or another sequence.
     """
 
     def __init__(

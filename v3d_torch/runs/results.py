@@ -14,6 +14,8 @@ from pathlib import Path
 
 import torch
 
+from v3d_torch.datasets import RGBDSequence
+from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.geometry.se3 import invert
@@ -115,6 +117,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
         "difference": describe_difference(pipeline.sequence),
+        "sequence_digest": sequence_digest(pipeline.sequence) if isinstance(pipeline.sequence, RGBDSequence) else None,
         "frames": pipeline.frame_count,
         "processed": frames,
         "skipped": len(run.broken),
