@@ -21,7 +21,6 @@ from v3d_torch.segmentation import COCO_NAMES, PERSON, YOLOSegmenter
 from v3d_torch.segmentation.export import exported_path
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.segmentation.weights import REGISTRY, find_weights
-from v3d_torch.segmentation.yolo import brighten
 from v3d_torch.types import RGBDFrame
 
 SMALL = {"height": 320, "width": 320, "threads": 1}
@@ -83,15 +82,6 @@ def test_detections_in_a_dark_image_have_the_scores_of_a_bright_one(name: str, l
     dark, bright = segmenter.segment((image * 0.06).to(torch.uint8)), segmenter.segment(image)
     assert COCO_NAMES[dark.labels[0]] == label
     assert dark.scores[0] > bright.scores[0] - 0.05
-
-
-def test_only_dark_images_are_brightened() -> None:
-    image = photograph("coffee")
-    assert brighten(image) is image
-    dark = (image * 0.3).to(torch.uint8)
-    assert brighten(dark).float().mean() == pytest.approx(64, abs=2)
-    assert torch.equal(brighten((image * 0.04).to(torch.uint8)), (image * 0.04).to(torch.uint8) * 4)
-    assert not brighten(torch.zeros(3, 20, 20, dtype=torch.uint8)).any()
 
 
 def test_convention_channels_are_rgb(segmenter: YOLOSegmenter) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig
 from v3d_torch.features import brief
+from v3d_torch.features.brightness import brighten
 from v3d_torch.features.corner_selection import select_corners
 from v3d_torch.features.fast import detect_corners
 from v3d_torch.features.features import Features, sample_depth
@@ -51,6 +52,8 @@ class ORB:
     def __call__(self, image: Tensor, depth: Tensor) -> Features:
         """Detect features in the whole image; masks are applied later, by `Features.in_mask`.
 
+        A dark image is brightened first, see `brighten`.
+
         Args:
             image: Colour image, uint8 RGB, shape :math:`(3, H, W)`.
             depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
@@ -58,7 +61,9 @@ class ORB:
         Returns:
             Features with the depth of their nearest pixel.
         """
-        grey = np.asarray(kornia_rs.imgproc.gray_from_rgb(image.permute(1, 2, 0).contiguous().numpy()))[..., 0]
+        grey = np.asarray(kornia_rs.imgproc.gray_from_rgb(brighten(image).permute(1, 2, 0).contiguous().numpy()))[
+            ..., 0
+        ]
         canvas = self._pyramid.build(grey)
         corners, level = self._detect(canvas)
         smoothed = kornia_rs.imgproc.gaussian_blur(canvas[..., None], _SMOOTHING_SIZE, _SMOOTHING_SIGMA)[..., 0]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from v3d_torch.config import SegmentationConfig
+from v3d_torch.features.brightness import brighten
 from v3d_torch.segmentation.decode import decode
 from v3d_torch.segmentation.export import exported_path
 from v3d_torch.segmentation.inference import SplitNetwork, WholeNetwork
@@ -17,13 +17,6 @@ from v3d_torch.segmentation.quantise import has_int8_instructions, quantised_pat
 from v3d_torch.segmentation.suppression import suppress_duplicates
 from v3d_torch.segmentation.weights import REGISTRY, find_weights
 from v3d_torch.types import Instances, RGBDFrame
-
-_MIN_BRIGHTNESS, _MAX_GAIN = 64.0, 4.0
-"""Mean brightness up to which images are brightened, grey levels, and the maximum factor: the photographs of the
-training are well exposed, and networks miss people in dark images. A larger factor mostly amplifies noise."""
-
-_SAMPLED = 8
-"""Step between the rows and columns from which the brightness is computed, pixels."""
 
 
 class YOLOSegmenter:
@@ -64,7 +57,7 @@ class YOLOSegmenter:
         return self.segment(frame.image)
 
     def segment(self, image: Tensor) -> Instances:
-        """Segment an image of any size. The network sees a dark image brightened.
+        """Segment an image of any size. The network sees a dark image brightened: it misses people in dark ones.
 
         Args:
             image: Colour image, uint8 RGB, shape :math:`(3, H, W)`.
@@ -85,14 +78,3 @@ class YOLOSegmenter:
             max_instances=self.config.max_instances,
         )
         return suppress_duplicates(instances, self.config.duplicate_overlap)
-
-
-def brighten(image: Tensor) -> Tensor:
-    """Brighten a dark image to a mean of a quarter of white, by a factor of at most four; return others unchanged.
-
-    Args:
-        image: Colour image, uint8, shape :math:`(3, H, W)`.
-    """
-    sample = image[:, ::_SAMPLED, ::_SAMPLED]
-    gain = min(_MIN_BRIGHTNESS / max(float(sample.mean(dtype=torch.float32)), 1.0), _MAX_GAIN)
-    return image if gain <= 1 else (image.to(torch.float32) * gain).clamp_(max=255).to(torch.uint8)
