@@ -47,7 +47,7 @@ class Extraction:
 
 @dataclass(frozen=True)
 class PreprocessedFrame:
-    """Result of `V3DSLAM.preprocess`: everything that is computed from the frame alone.
+    """Result of `V3DSLAM.preprocess`: everything that is computed before tracking.
 
     Attributes:
         frame: Frame.

@@ -70,8 +70,8 @@ class V3DSLAM(FramePreprocessor):
 
     `preprocess` runs the stages that depend only on the frame, see `FramePreprocessor`; `track` runs the others. Every
     stage is an attribute and can be replaced by a callable with the same signature; the results of the replacement are
-    checked. `loop_closer` is also used inside other stages, which keep their own references to the original. Hooks see
-    the arguments and results of stages, see `register_stage_hook`.
+    checked. `estimate_motion`, `track_map` and `loop_closer` are used inside other stages and cannot be replaced alone.
+    Hooks see the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -213,17 +213,17 @@ class V3DSLAM(FramePreprocessor):
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
             T_cw, was_lost = self._compose_pose(motion), self.poses.status is TrackingStatus.LOST
-            view = self.free_space_check.make_view(frame.stamp, depth, T_cw, has_motion=motion.is_measured)
-            occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
+            view = self.free_space_check.make_view(frame.stamp, depth, T_cw, is_motion_measured=motion.is_measured)
+            newly_occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
         segmentation = self._wait_for_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
-            instances = self._complete_instances(segmentation.instances, view, occupied)
+            instances = self._complete_instances(segmentation.instances, view, newly_occupied)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
             appearance = self.describe_appearance(frame.image, clouds.cloud_pixels)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))
-            objects = self.classify_motion(instances, clouds, view, occupied, support, appearance)
+            objects = self.classify_motion(instances, clouds, view, newly_occupied, support, appearance)
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
@@ -333,13 +333,15 @@ class V3DSLAM(FramePreprocessor):
         self.timer.add(segmentation.times)
         return segmentation
 
-    def _complete_instances(self, instances: Instances | None, view: DepthView, occupied: NewlyOccupied) -> Instances:
+    def _complete_instances(
+        self, instances: Instances | None, view: DepthView, newly_occupied: NewlyOccupied
+    ) -> Instances:
         """Redraw the previous objects in a frame without segmentation, and add moving regions without a class."""
         if instances is None:
             instances = self.classify_motion.propagate_instances(view)
         if not self._proposes_objects:
             return instances
-        return instances.concatenate(self.propose_unlabelled(occupied, instances, view.depth))
+        return instances.concatenate(self.propose_unlabelled(newly_occupied, instances, view.depth))
 
     def _extend_map(
         self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion

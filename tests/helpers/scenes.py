@@ -434,7 +434,7 @@ class ObjectStage:
         The clouds use ``cloud_depth`` if it is given, everything else uses ``depth``.
         """
         guess = guess or Guess(T_wc)
-        view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), has_motion=guess.is_measured)
+        view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), is_motion_measured=guess.is_measured)
         newly_occupied = self._free_space_check(view, pose_known=guess.is_measured and not self._is_lost)
         if instances is None:
             instances = self._classify.propagate_instances(view)

@@ -91,7 +91,7 @@ def test_stages_of_the_documentation_run(moment: Path, monkeypatch: pytest.Monke
     for frame in sequence:
         difference = expected(frame).T_wc[:3, 3] - slam(frame).T_wc[:3, 3]
         assert difference.norm() < 0.01 and slam.poses.status is TrackingStatus.TRACKED
-        measured.append(slam.poses.has_motion)
+        measured.append(slam.poses.is_motion_measured)
     assert measured == [False, *[True] * 5]
     depth = sequence[0].depth[None]
     assert torch.equal(slam.smooth_depth(depth) > 0, depth > 0)

@@ -240,4 +240,6 @@ def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> N
     ],
 )
 def test_log_says_whether_the_images_tell_the_readout(readout: Readout, text: str) -> None:
-    assert describe_readout(readout, Config().rolling_shutter) == text
+    config = Config().rolling_shutter
+    assert describe_readout(readout, config) == text
+    assert describe_readout(readout, config.model_copy(update={"enabled": False})) == "not compensated"

@@ -204,10 +204,12 @@ def test_replaced_stage_is_checked_with_numbers_too() -> None:
         slam(FRAMES[0])
 
 
-@pytest.mark.parametrize("stage", ["estimate_motion", "track_map"])
+@pytest.mark.parametrize("stage", ["estimate_motion", "track_map", "loop_closer"])
 def test_stage_that_only_other_stages_call_cannot_be_replaced(stage: str) -> None:
     slam = make_slam()
-    with pytest.raises(ConfigError, match=f"^{stage} cannot be replaced, because .* calls it; replace that stage$"):
+    with pytest.raises(
+        ConfigError, match=f"^{stage} cannot be replaced, because it is used inside .*; replace that instead$"
+    ):
         setattr(slam, stage, getattr(slam, stage))
 
 

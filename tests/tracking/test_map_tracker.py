@@ -83,7 +83,7 @@ def test_landmarks_occluded_for_many_frames_are_culled_only_without_depth(with_d
     left = wall.features.pixel[:, 0] < 320
     for _ in range(30):
         tracking = wall.track(wall.features[~left], EYE, board_in_left_half(0.5) if with_depth else None)
-        wall.map.count_matches(tracking.found, tracking.visible)
+        wall.map.count_matches(tracking.observed_landmarks, tracking.visible)
     wall.map.insert_keyframe(1, 1.0, EYE, wall.features[~left], tracking.landmarks)
     wall.map.cull_landmarks()
     active = wall.map.landmarks["active"][wall.first.landmarks]

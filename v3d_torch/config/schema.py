@@ -39,7 +39,7 @@ class SegmentationConfig(Section):
     YOLOv8)."""
     duplicate_overlap: float = Field(0.7, gt=0, le=1)
     """An instance is a duplicate if a larger fraction of it lies within an instance of the same class with a higher
-    score."""
+    score, or if its mask and that of an instance of another class coincide to this fraction."""
     upright: bool = True
     """True to rotate the images of a rolled camera upright before segmentation (false in the paper)."""
     max_instances: int = Field(32, gt=0)
@@ -71,8 +71,8 @@ class CloudConfig(Section):
     the points of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN. It is scaled to the size of
     the images, and to a shorter focal length."""
     max_depth: float = Field(6.0, gt=0)
-    """Maximum depth of points, metres: the depth error of a Kinect reaches 0.1 m there, as large as the motion to
-    detect."""
+    """Maximum depth of points, metres: two standard deviations of the depth of a Kinect are 0.1 m there, as large as
+    the motion to detect."""
     voxel_size: float = Field(0.02, gt=0)
     """Side of a voxel, metres (authors' code)."""
     eps: float = Field(0.08, gt=0)
@@ -93,7 +93,8 @@ class TrackerConfig(Section):
     """Maximum jump of a centroid, metres, in addition to its motion: the centroid also jumps when an object is cut off
     by the image border or occluded."""
     acceleration_noise: float = Field(1.2, gt=0)
-    """Standard deviation of the change of velocity in one second, m/s^2: a person can stop or turn within a second."""
+    """Square root of the spectral density of the acceleration, m/s^1.5, which is the standard deviation of the change
+    of velocity in one second: a person can stop or turn within a second."""
     min_overlap: float = Field(0.4, ge=0, le=1)
     """Minimum mask overlap to continue an object with an instance of another class: the class of an object can flicker
     between frames, but a cup does not turn into the table below it."""
@@ -102,7 +103,7 @@ class TrackerConfig(Section):
     ablation."""
     max_lost_time: float = Field(5.0, ge=0)
     """Time after `max_missed_time` in which an object that reappears keeps its id, seconds: people walk behind others,
-    or leave the view of a camera that turns. Appearance and position have to match. 0 in the ablation."""
+    or leave the view of a camera that turns. Appearance and position have to match."""
     compare_appearance: bool = True
     """Compare the colours of instances with those of objects. False in the ablation."""
 
@@ -137,9 +138,10 @@ class FreeSpaceConfig(Section):
     min_unlabelled_area: float = Field(0.02, gt=0)
     """Minimum area of an unlabelled moving region, square metres: a hand with its forearm. Infinite in the ablation."""
     max_depth: float = Field(6.0, gt=0)
-    """Maximum depth of points that are checked, metres: beyond, the depth error is as large as the motion to detect."""
+    """Maximum depth of points that are checked, metres: beyond, two standard deviations of the depth are as large as
+    the motion to detect."""
     tolerance: float = Field(0.01, gt=0)
-    """Depth tolerance divided by the squared depth, 1/m: four standard deviations of the depth of a structured-light
+    """Depth tolerance divided by the squared depth, 1/m: seven standard deviations of the depth of a structured-light
     camera."""
     min_tolerance: float = Field(0.04, gt=0)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
@@ -176,11 +178,11 @@ class StaticMaskConfig(Section):
     """
 
     confirm_static_time: float = Field(1.0, ge=0)
-    """Time after the first detection for which a person is masked, unless observed at rest, seconds (the paper masks
-    persons until they are classified). A person without usable depth stays masked."""
+    """Time after the first detection for which a person or animal is masked, unless observed at rest, seconds (the
+    paper masks persons until they are classified). Without usable depth, they stay masked."""
     hold_dynamic_time: float = Field(1.0, ge=0)
     """Time for which an object stays dynamic or deforming after the last evidence, seconds: a walking person pauses
-    between steps. An object other than a person becomes static as soon as it is observed at rest."""
+    between steps. A rigid object becomes static as soon as it is observed at rest."""
     confirm_dynamic_frames: int = Field(2, gt=0)
     """Number of frames with evidence before a dynamic state is held: evidence in a single frame can be depth noise."""
     dilation: int = Field(1, ge=0, le=100)
@@ -228,8 +230,8 @@ class FeaturesConfig(Section):
     cell: int = Field(32, gt=0)
     """Side of the grid cells over which selected features are spread, pixels."""
     max_depth: float = Field(8.0, gt=0)
-    """Maximum depth of features, metres: the depth error of a Kinect exceeds 0.2 m there. Beyond it a feature has no
-    depth."""
+    """Maximum depth of features, metres: the standard deviation of the depth of a Kinect is 0.09 m there. Beyond it a
+    feature has no depth."""
 
 
 class OdometryConfig(Section):
@@ -377,7 +379,7 @@ class DenseMapConfig(Section):
     max_depth: float = Field(4.0, gt=0)
     """Maximum depth of points, metres; the noise of farther points would blur the map."""
     voxel_size: float = Field(0.01, gt=0)
-    """Side of a voxel, metres: about the depth noise at 2 m."""
+    """Side of a voxel, metres: nearly twice the standard deviation of the depth of a Kinect at 2 m."""
     mesh: MeshConfig = MeshConfig()
 
 
@@ -470,7 +472,8 @@ class CheckpointConfig(Section):
     """Checkpoints, from which an interrupted run is resumed."""
 
     interval: float = Field(30.0, ge=0)
-    """Minimum time between checkpoints, seconds. 0 saves after every frame, infinity never."""
+    """Minimum time between checkpoints, seconds; infinity saves none. With 0, only `max_time_fraction` limits them: 0
+    and a fraction of 1 save after every frame."""
     max_time_fraction: float = Field(0.02, gt=0, le=1)
     """Maximum fraction of the run time spent on checkpoints: they grow with the run, and are saved less often."""
 

@@ -45,9 +45,9 @@ class LiveResult(FrameResult):
 class LiveSLAM:
     """Runs `V3DSLAM` on a live camera: capture, preprocessing and tracking run in parallel.
 
-    Each stage takes the newest frame that is ready, and no other frame waits. If tracking is slower than the camera,
-    frames are dropped and counted. Iterate over the results, or call the object with a callback; both end with the
-    source.
+    Each stage takes the newest frame that is ready, and no other frame waits, except the first. If tracking is slower
+    than the camera, frames are dropped and counted. Iterate over the results, or call the object with a callback; both
+    end with the source.
 
     Args:
         source: Frames at their own rate: a camera (``open_source("realsense:")``), a `RealtimePlayback`, or any

@@ -97,7 +97,7 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
         config: Configuration of the current run, with the feature settings of the map.
 
     Raises:
-        InputError: If the file is missing, not a map file, damaged, or of a different version, camera or configuration.
+        InputError: If the file is missing, not a map file, damaged, or of another version, camera or configuration.
     """
     path = Path(path)
     stored = StoredMap(SparseMap(config.mapping, config.features, camera), StaticViews(camera, config.dense_map.stride))

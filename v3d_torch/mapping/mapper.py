@@ -13,7 +13,7 @@ from v3d_torch.mapping.landmark_fusion import LandmarkFusion
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
 
-_MIN_INTERVAL = 4
+_MIN_KEYFRAME_INTERVAL = 4
 """Minimum number of frames between keyframes if the landmarks are few but the view has not changed: where an image
 never shows ``mapping.min_tracked`` landmarks, every frame would become a keyframe."""
 
@@ -89,7 +89,7 @@ class Mapper:
         if interval >= config.max_keyframe_interval:
             return True
         view_changed = pose.count < config.min_tracked_ratio * self._most_tracked
-        weak = view_changed or (pose.count < config.min_tracked and interval >= _MIN_INTERVAL)
+        weak = view_changed or (pose.count < config.min_tracked and interval >= _MIN_KEYFRAME_INTERVAL)
         new_landmarks = (pose.landmarks < 0) & (features.depth > 0)
         return weak and int(new_landmarks.sum()) >= self._config.tracking.min_inliers
 

@@ -18,7 +18,8 @@ class MotionState(StrEnum):
     STATIC = "static"
     """At rest: its pixels are tracked and, unless it is a person, mapped."""
     DYNAMIC = "dynamic"
-    """It moved: the free-space check shows it and enough objects vote for it, or it is new, in space that was free."""
+    """It moved: most of it is where an earlier view saw free space, or most of its former place is free now and enough
+    objects vote for it."""
     DEFORMING = "deforming"
     """A person or animal that changes its shape in place, by the Chamfer distance."""
     UNKNOWN = "unknown"

@@ -79,15 +79,15 @@ class DepthView:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         misalignment: Largest offset of the depth from the colour image that the pose refers to, pixels. It arises when
             the camera turns between both exposures.
-        has_motion: True if the motion of the camera since the previous frame is measured; otherwise the pose is a
-            guess.
+        is_motion_measured: True if the motion of the camera since the previous frame is measured; otherwise the pose is
+            a guess.
     """
 
     stamp: float
     depth: Tensor
     T_cw: Tensor
     misalignment: int = 0
-    has_motion: bool = True
+    is_motion_measured: bool = True
 
     @cached_property
     def missing(self) -> Tensor:
@@ -263,22 +263,22 @@ class FreeSpaceCheck:
         self._stride = max(1, round(camera.width / _COLUMNS))
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
-    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, has_motion: bool = True) -> DepthView:
+    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, is_motion_measured: bool = True) -> DepthView:
         """Make a view. Its misalignment follows from the camera's rotation rate since the last stored view.
 
         Args:
             stamp: Timestamp, seconds.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-            has_motion: True if the motion of the camera since the previous frame is measured.
+            is_motion_measured: True if the motion of the camera since the previous frame is measured.
         """
         if not self._views:
-            return DepthView(stamp, depth, T_cw, has_motion=has_motion)
+            return DepthView(stamp, depth, T_cw, is_motion_measured=is_motion_measured)
         last = self._views[-1]
         angle = float(np.linalg.norm(cv2.Rodrigues((T_cw @ invert(last.T_cw))[:3, :3].numpy())[0]))
         rotation_rate = angle / max(stamp - last.stamp, MIN_INTERVAL)
         misalignment = round(self._camera.fx * rotation_rate * self._config.depth_sync_error)
-        return DepthView(stamp, depth, T_cw, misalignment, has_motion)
+        return DepthView(stamp, depth, T_cw, misalignment, is_motion_measured)
 
     def __call__(self, view: DepthView, *, pose_known: bool = True) -> NewlyOccupied:
         """Compare a view with the stored views.

@@ -26,8 +26,10 @@ class InstanceClouds:
     """Point clouds of N instances, padded to one length.
 
     Attributes:
-        points: Voxel means, camera frame, metres, float32, shape :math:`(N, P, 3)`.
-        valid: Mask of the points that are not padding, bool, shape :math:`(N, P)`; False for padding.
+        points: Voxel means of the masked pixels, outliers included, camera frame, metres, float32, shape
+            :math:`(N, P, 3)`.
+        valid: Mask of the points of the object, the largest cluster, bool, shape :math:`(N, P)`; False for outliers and
+            padding.
         centroid: Mean of the points, float32, shape :math:`(N, 3)`; NaN if a cloud has too few points.
         cloud_pixels: Pixels of each mask whose point belongs to the cloud, bool, shape :math:`(N, H, W)`.
     """

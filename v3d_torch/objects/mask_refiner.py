@@ -29,7 +29,8 @@ from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixe
 from v3d_torch.objects.track import Track
 
 _TOLERANCE_GROWTH = 0.01
-"""Growth of the depth tolerance with the square of depth, 1/m: four times the error of a structured-light camera."""
+"""Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
+depth of a structured-light camera."""
 
 
 class MaskRefiner:

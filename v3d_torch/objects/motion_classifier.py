@@ -81,7 +81,7 @@ class MotionClassifier:
         """
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
-        if not view.has_motion and self._last_stamp > -torch.inf:
+        if not view.is_motion_measured and self._last_stamp > -torch.inf:
             self.tracker.start_guess(stamp)
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]

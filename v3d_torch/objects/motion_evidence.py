@@ -150,7 +150,8 @@ def hough_vote_evidence(
         return VoteEvidence({}, set(), [])
     max_votes: dict[Track, int] = {}
     vote_pairs: set[tuple[int, int]] = set()
-    # A newly detected object has no earlier distance to compare, so only the free-space check votes for it.
+    # An object of which most appeared in free space needs no votes: a new one has no earlier distance to compare, and
+    # of a known one this shows the motion directly.
     dynamic = {track for track in detected if free_space.has_appeared(track)}
     for time_span in config.time_spans:
         compared = pairs[time_span]

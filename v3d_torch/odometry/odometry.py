@@ -42,7 +42,8 @@ class CameraMotion:
 
     Attributes:
         T_cp: Maps points from the previous camera to the current one, float64, shape :math:`(4, 4)`.
-        velocity: Mean twist per second, ``[m/s, rad/s]``, float64, shape :math:`(6,)`.
+        velocity: ``se3_log(T_cp)`` divided by the time, ``[m/s, rad/s]``, float64, shape :math:`(6,)`: the velocity of
+            static points in the camera frame. `CameraState.twist`, that of the camera, has the opposite sign.
         pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape
             :math:`(K, 2)`; K = 0 for a motion found by dense alignment, and for a prediction.
         is_measured: True if the frames were registered, False if the motion is only predicted.
@@ -97,7 +98,7 @@ class Odometry:
             previous: Previous frame, whose static pixels are known; None for the first frame.
             current: Current frame.
             T_cp: Predicted motion, float64, shape :math:`(4, 4)`.
-            velocity: Predicted mean twist per second, float64, shape :math:`(6,)`.
+            velocity: Predicted velocity, see `CameraMotion`, float64, shape :math:`(6,)`.
 
         Returns:
             The prediction if neither features nor dense alignment give a plausible motion.

@@ -148,7 +148,10 @@ def _box_values(box: UprightBox | None) -> list[float]:
 
 
 class StateTable(TensorTable):
-    """States of the camera at each frame, without later corrections, one row per frame; columns as in `CameraState`."""
+    """States of the camera at each frame, without later corrections, one row per frame.
+
+    The columns are those of `CameraState` without the covariances of the twist.
+    """
 
     def __init__(self) -> None:
         super().__init__(
@@ -219,7 +222,8 @@ class RunRecord:
         interrupted: True if the user interrupted the run.
         mask_error: Reason why the masks were not evaluated although there are true masks; None if there was no error.
         save_error: Reason why a checkpoint could not be written; None if there was no error.
-        warnings: Contradictions between the images and the camera, one sentence each.
+        warnings: Contradictions between the images and the camera, notes on the source, and map files that were not
+            written, one sentence each.
         people_sizes: Apparent sizes of people in the keyframes before the check, metres.
         was_checked: True if camera and depth were checked.
     """

@@ -161,6 +161,8 @@ class Run:
 
 def describe_readout(readout: Readout, expected: RollingShutterConfig) -> str:
     """Return the readout in words, and whether the images tell it."""
+    if not expected.enabled:
+        return "not compensated"
     if readout.is_certain:
         return f"{readout.seconds:.4f} s, as the camera states"
     if readout.sigma > expected.readout_sigma / 2:

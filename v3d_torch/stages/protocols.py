@@ -77,7 +77,7 @@ class OdometryStage(Protocol):
             previous: Previous frame, whose static pixels are known; None for the first frame.
             current: Current frame.
             T_cp: Predicted pose of the previous camera in the current one, float64, shape :math:`(4, 4)`.
-            velocity: Predicted mean twist per second, float64, shape :math:`(6,)`.
+            velocity: Predicted velocity, see `CameraMotion`, float64, shape :math:`(6,)`.
         """
 
 

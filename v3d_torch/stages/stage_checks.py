@@ -89,16 +89,20 @@ _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] |
     "classify_motion": (FrameObjects, lambda instances, clouds, view, *_: _image_size(view.depth)),
     "track_camera": (FramePose, lambda features, *_: {"N": len(features)}),
     "estimate_state": (CameraState, lambda *_: {}),
-    **dict.fromkeys(("motion_model", "refine_previous", "mapper", "back_end", "loop_closer")),
+    **dict.fromkeys(("motion_model", "refine_previous", "mapper", "back_end")),
 }
 """Expected result of each stage, and a function that returns the sizes given by the stage's arguments; None if the
 result is not checked."""
 
 
-_INNER_STAGES = {"estimate_motion": "odometry", "track_map": "track_camera"}
-"""Stages that `V3DSLAM` does not call itself, and the stage that calls each."""
+_INNER_STAGES = {
+    "estimate_motion": "odometry",
+    "track_map": "track_camera",
+    "loop_closer": "track_camera and back_end",
+}
+"""Stages that are used inside others, which keep their own references, and these others."""
 
-STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end", "loop_closer")))
+STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end")))
 """Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
 
 
@@ -119,7 +123,9 @@ class ReplaceableStages:
                 inside another stage only, so that its replacement would have no effect.
         """
         if name in _INNER_STAGES and name in vars(self):
-            raise ConfigError(f"{name} cannot be replaced, because {_INNER_STAGES[name]} calls it; replace that stage")
+            raise ConfigError(
+                f"{name} cannot be replaced, because it is used inside {_INNER_STAGES[name]}; replace that instead"
+            )
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
         is_hooked = isinstance(vars(self).get(name), HookedStage)

@@ -22,7 +22,8 @@ class CameraState:
 
     Attributes:
         stamp: Time, seconds.
-        T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`; the world frame is that of the first camera.
+        T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`; the world frame is that of the first camera, or
+            of the loaded map.
         status: Source of the pose.
         covariance: Covariance of the error xi of the pose, where ``T_wc @ se3_exp(xi)`` is the true pose, float64,
             shape :math:`(6, 6)`.

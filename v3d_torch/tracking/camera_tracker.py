@@ -75,7 +75,7 @@ class CameraTracker:
                 match = self._relocaliser.relocalise(features, self._map)
                 tracking = None if match is None else match.tracking
             if tracking is not None:
-                self._map.count_matches(tracking.found, tracking.visible)
+                self._map.count_matches(tracking.observed_landmarks, tracking.visible)
                 return FramePose(
                     TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks, tracking.information, is_relocalised
                 )

@@ -41,14 +41,14 @@ class MapTracking:
     information: Tensor
 
     @property
-    def found(self) -> Tensor:
+    def observed_landmarks(self) -> Tensor:
         """IDs of the landmarks that were found, int64, shape :math:`(F,)`."""
         return self.landmarks[self.landmarks >= 0]
 
     @property
     def count(self) -> int:
         """Number of landmarks that were found."""
-        return len(self.found)
+        return len(self.observed_landmarks)
 
 
 class MapTracker:

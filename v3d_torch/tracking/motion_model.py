@@ -59,18 +59,18 @@ class MotionModel:
         return PosePrediction(stamp, poses.T_cw, self.velocity)
 
     def previous_velocity(self, poses: PoseHistory, motion: CameraMotion) -> Tensor | None:
-        """Mean twist per second around the last frame, from the motion before and after it.
+        """Mean velocity around the last frame, from the motion before and after it.
 
         Args:
             poses: Poses of all frames so far.
             motion: Motion of the camera since the last of these frames.
 
         Returns:
-            Twist per second, float64, shape :math:`(6,)`; None if it is not known.
+            Velocity, see `CameraMotion`, float64, shape :math:`(6,)`; None if it is not known.
         """
         if not len(poses) or poses.status is TrackingStatus.LOST or not motion.is_measured:
             return None
-        return (self.velocity + motion.velocity) / 2 if poses.has_motion else motion.velocity
+        return (self.velocity + motion.velocity) / 2 if poses.is_motion_measured else motion.velocity
 
     def update(self, poses: PoseHistory, stamp: float, pose: FramePose, motion: CameraMotion) -> None:
         """Update the velocity with a new frame.

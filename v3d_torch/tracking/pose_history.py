@@ -31,7 +31,7 @@ class PoseHistory:
             status=((), torch.int64),  # position in TrackingStatus, as it was known when the row was made
             keyframe=((), torch.int64),  # index of the keyframe; -1 for the world frame, before the first keyframe
             T_ck=((4, 4), torch.float64),  # motion from the keyframe to the camera
-            has_motion=((), torch.bool),  # true if the motion since the previous frame was measured
+            is_motion_measured=((), torch.bool),  # true if the motion since the previous frame was measured
         )
         self._keyframes: dict[int, Keyframe] = {}  # to which poses are relative, by index
         self.last_localised = -torch.inf
@@ -76,9 +76,9 @@ class PoseHistory:
         return 0 if self._place is None else self._place.part
 
     @property
-    def has_motion(self) -> bool:
+    def is_motion_measured(self) -> bool:
         """True if the motion between the last frame and the one before it was measured."""
-        return bool(len(self) and self._frames["has_motion"][-1])
+        return bool(len(self) and self._frames["is_motion_measured"][-1])
 
     @property
     def is_localised(self) -> bool:
@@ -127,7 +127,7 @@ class PoseHistory:
             status=torch.tensor([_STATUSES.index(status)]),
             keyframe=torch.tensor([self._add_keyframe(keyframe)]),
             T_ck=T_ck[None],
-            has_motion=torch.tensor([motion.is_measured]),
+            is_motion_measured=torch.tensor([motion.is_measured]),
         )
         if status is not TrackingStatus.LOST:
             self.last_localised = stamp
@@ -184,7 +184,7 @@ class PoseHistory:
             frames["keyframe"][row] = self._add_keyframe(keyframe)
             if linked:
                 frames["status"][row] = _STATUSES.index(found)
-            linked = linked and bool(frames["has_motion"][row])
+            linked = linked and bool(frames["is_motion_measured"][row])
 
     def _add_keyframe(self, keyframe: Keyframe | None) -> int:
         """Keep a keyframe to which a pose is relative, and return its index; -1 for None."""

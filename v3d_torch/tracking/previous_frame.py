@@ -41,7 +41,8 @@ class PreviousFrameRefinement:
 
         Args:
             previous: Last frame of the history; None before the second frame.
-            velocity: Mean twist per second around this frame, float64, shape :math:`(6,)`; None if it is not known.
+            velocity: Mean velocity around this frame, see `CameraMotion`, float64, shape :math:`(6,)`; None if it is
+                not known.
             poses: Poses of all frames so far.
             compensate: Compensation of rolling shutter and depth delay, see `TimeCompensation`.
         """
