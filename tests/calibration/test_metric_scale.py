@@ -38,6 +38,14 @@ def test_errors_agree_with_the_uncertainty() -> None:
     assert 0.3 < sum(squared) / len(squared) < 2.0
 
 
+def test_errors_of_the_estimate_do_not_shrink_the_scale() -> None:
+    """The positions are spread by 0.3 m; a regression on the estimated ones would give 0.97."""
+    found = [metric_scale(make_trajectory(200), make_trajectory(200, noise=0.04, seed=seed)) for seed in range(20)]
+    mean = sum(each[0] for each in found if each is not None) / len(found)
+    assert mean == pytest.approx(1.0, abs=0.005)
+
+
 def test_few_poses_and_a_camera_that_only_turns_tell_no_scale() -> None:
     assert metric_scale(make_trajectory(5), make_trajectory(5)) is None
     assert metric_scale(make_trajectory(size=0.0), make_trajectory(size=0.0)) is None
+    assert metric_scale(make_trajectory(), make_trajectory(scale=0.0)) is None

@@ -14,7 +14,11 @@ _MIN_PAIRS = 10
 
 
 def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, float] | None:
-    """Scale of a measured trajectory relative to an estimated trajectory (Umeyama, PAMI 1991).
+    """Scale of a measured trajectory relative to an estimated trajectory.
+
+    It is the inverse of the factor by which the measured positions fit the estimated ones best. Measured positions are
+    more accurate; the factor in the other direction (Umeyama, PAMI 1991) would be too small, by the variance of the
+    errors of the estimated positions relative to that of the positions.
 
     Args:
         groundtruth: Measured poses, in metres.
@@ -22,18 +26,20 @@ def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, 
 
     Returns:
         Ratio and its standard deviation, by the jackknife over blocks of time; None if the trajectories have too few
-        common poses, or if the positions do not span a plane.
+        common poses, if the positions of one do not span a plane, or if the estimated ones do not follow the others.
     """
     matches = associate_trajectories(groundtruth, estimate)
     if len(matches) < _MIN_PAIRS:
         return None
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
-    if not spans_plane(T_gc[:, :3, 3]):
+    if not (spans_plane(T_gc[:, :3, 3]) and spans_plane(T_ec[:, :3, 3])):
         return None
     aligned = align(T_gc, T_ec).T_ge @ T_ec
     measured, estimated = (T[:, :3, 3] - T[:, :3, 3].mean(dim=0) for T in (T_gc, aligned))
-    squared = estimated.square().sum(dim=1)
-    scale = float((measured * estimated).sum() / squared.sum())
-    gradient = -2 * (estimated * (measured - scale * estimated)).sum(dim=1)
+    squared = measured.square().sum(dim=1)
+    factor = float((measured * estimated).sum() / squared.sum())
+    if factor <= 0:
+        return None
+    gradient = -2 * (measured * (estimated - factor * measured)).sum(dim=1)
     variance = jackknife_covariance(gradient[:, None], 2 * squared[:, None, None])
-    return scale, float(torch.sqrt(variance[0, 0]))
+    return 1 / factor, float(torch.sqrt(variance[0, 0])) / factor**2
