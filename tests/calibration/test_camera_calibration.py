@@ -40,10 +40,11 @@ def calibrate(scale: float | None = None, delay: float = 0.0, given: PinholeCame
     _, trajectory = make_views(COUNT)
     groundtruth = None
     if scale is not None:
-        T_wc = trajectory.T_wc.clone()
+        T_wc, estimated = trajectory.T_wc.clone(), trajectory.T_wc.clone()
         noise = torch.randn(len(T_wc), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-        T_wc[:, :3, 3] = scale * (T_wc[:, :3, 3] + 0.0001 * noise)
-        groundtruth = Trajectory(trajectory.stamps, T_wc)
+        T_wc[:, :3, 3] *= scale
+        estimated[:, :3, 3] += 0.0001 * noise
+        groundtruth, trajectory = Trajectory(trajectory.stamps, T_wc), Trajectory(trajectory.stamps, estimated)
     return calibrate_camera(MapTables(), views, trajectory, groundtruth, given, given, Config())
 
 
