@@ -127,9 +127,9 @@ def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Pat
     same = [name for name in files_in(first_out) if not name.endswith(("run.log", "metrics.json", "frames.parquet"))]
     assert len(same) > 35
     assert [name for name in same if (tmp_path / "out" / name).read_bytes() != (first_out / name).read_bytes()] == []
-    done = call_here(*arguments, "--out", "again", cwd=tmp_path)
+    done = call_here(*arguments, "--out", "again", "--rerun", "run.rrd", cwd=tmp_path)
     assert_error_line(done, "run.mcap: already exists; delete it, or choose another file")
-    assert not (tmp_path / "again").exists()
+    assert not (tmp_path / "again").exists() and not (tmp_path / "run.rrd").exists()
 
 
 def test_run_prints_scores_and_result_folder(

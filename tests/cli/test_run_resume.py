@@ -280,6 +280,15 @@ def out(half_run: Path, tmp_path: Path) -> Path:
     return tmp_path / "out"
 
 
+def test_recording_of_the_first_frames_is_not_replaced(out: Path) -> None:
+    recording, before = out.parent / "run.rrd", (out / "metrics.json").read_bytes()
+    recording.write_text("the first frames")
+    done = call("--resume", out, "--rerun", recording)
+    assert_error_line(done, f"{recording}: already exists; delete it, or choose another file with --rerun")
+    assert recording.read_text() == "the first frames"
+    assert (out / "metrics.json").read_bytes() == before and (out / CHECKPOINT).is_file()
+
+
 def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")}
     done = call("--resume", whole_run)

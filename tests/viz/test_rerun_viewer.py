@@ -398,6 +398,15 @@ def test_unknown_viewer_unwritable_file_and_missing_library_are_errors(
             make_viewer(viz, tmp_path / "run.rrd", Wall())
 
 
+@pytest.mark.parametrize("viz", [None, "rerun"])
+def test_existing_recording_is_an_error_and_stays(viz: str | None, tmp_path: Path) -> None:
+    file = tmp_path / "run.rrd"
+    file.write_text("precious")
+    with pytest.raises(OutputError, match=r"run\.rrd: already exists; delete it, or choose another file with --rerun"):
+        make_viewer(viz, file, Wall())
+    assert file.read_text() == "precious"
+
+
 def test_incomplete_recording_is_a_failure_after_all_frames(tmp_path: Path) -> None:
     class Full(RerunViewer):
         def _log_map(self, slam: V3DSLAM) -> None:

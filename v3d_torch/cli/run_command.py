@@ -70,8 +70,8 @@ class Display:
 
     Attributes:
         viz: Viewer that shows the run live, ``rerun``; None for no viewer.
-        rerun_file: File in which the run is recorded for rerun; None for no recording.
-        bag: File in which the run is recorded as ROS 2 messages; None for no recording.
+        rerun_file: New file in which the run is recorded for rerun; None for no recording.
+        bag: New file in which the run is recorded as ROS 2 messages; None for no recording.
         profile: True to print the time of each stage.
     """
 
@@ -86,13 +86,14 @@ class Display:
         Raises:
             ConfigError: If the viewer is unknown.
             ViewerError: If the viewer cannot be started.
-            OutputError: If a recording cannot be written.
+            OutputError: If a recording exists or cannot be written.
         """
-        viewers = [make_viewer(self.viz, self.rerun_file, sequence)]
+        viewers: list[Viewer] = []
         if self.bag is not None:
             from v3d_torch.export.ros.bag_viewer import BagViewer  # slow: loads the definitions of all messages
 
             viewers.append(BagViewer(self.bag, sequence.camera))
+        viewers.append(make_viewer(self.viz, self.rerun_file, sequence))  # last, because it creates its file
         return ViewerGroup(viewers)
 
 

@@ -14,13 +14,13 @@ def make_viewer(viz: str | None, rerun_file: Path | None, sequence: RGBDStream) 
 
     Args:
         viz: ``rerun`` to show the run while it is processed; None for no window.
-        rerun_file: Rerun recording to write, ``.rrd``; None for no recording.
+        rerun_file: Rerun recording to write, ``.rrd``, which must not exist; None for no recording.
         sequence: Sequence to process.
 
     Raises:
         ConfigError: If the viewer is unknown.
         ViewerError: If the viewer's library is not installed, or the viewer cannot be started.
-        OutputError: If the recording cannot be written.
+        OutputError: If the recording exists or cannot be written.
     """
     if viz not in (None, "rerun"):
         raise ConfigError(f"--viz {viz}: unknown viewer; use --viz rerun")

@@ -33,13 +33,16 @@ def open_stream(*, live: bool, file: Path | None, port: int = PORT) -> rr.Record
 
     Args:
         live: True to show the recording in the viewer that listens on this machine, or in a new viewer.
-        file: File to record to, ``.rrd``; None for no file.
+        file: File to record to, ``.rrd``, which must not exist; None for no file.
         port: Port of the viewer.
 
     Raises:
         ViewerError: If no viewer can be started.
-        OutputError: If the file cannot be written.
+        OutputError: If the file exists or cannot be written.
     """
+    # The library would replace the file, such as the first part of a run that is resumed with the same options.
+    if file is not None and file.is_file():
+        raise OutputError(f"{file}: already exists; delete it, or choose another file with --rerun")
     stream = rr.RecordingStream("v3d_torch", recording_id=uuid4())
     sinks: list[rr.GrpcSink | rr.FileSink] = []
     if live:
