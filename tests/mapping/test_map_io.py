@@ -95,6 +95,14 @@ def test_loaded_map_equals_the_saved_map(keyframes: int, tmp_path: Path) -> None
     assert torch.equal(loaded.map.covisibility_edges(1), stored.map.covisibility_edges(1))
 
 
+def test_view_of_a_culled_keyframe_is_not_saved(tmp_path: Path) -> None:
+    stored = random_map()
+    stored.map.keyframes[2].reference = 1  # culled after the last view was added
+    loaded = load_map(write_map(tmp_path, stored), CAMERA, CONFIG)
+    assert [view.keyframe.index for view in loaded.views] == [0, 1, 3]
+    assert_same(stored, loaded)
+
+
 def test_map_without_sigma_ratios_has_ones(tmp_path: Path) -> None:
     stored = random_map()
     for keyframe in stored.map.keyframes:

@@ -48,9 +48,20 @@ def test_views_with_the_state_of_other_views_continue_like_them() -> None:
         original.add(own, GREY, torch.full((1, 240, 320), 1.0 + own.frame), ALL)
     restored.load_state_dict({name: list(views) for name, views in original.state_dict().items()})
     assert list(restored) == list(original)  # the same objects
-    first.reference = 1  # culled: its view is removed when the next one is added
+    first.reference = 1  # culled
     for views in (original, restored):
         views.add(third, GREY, torch.full((1, 240, 320), 3.0), ALL)
         assert [view.keyframe for view in views] == [second, third]
     for ours, other in zip(original, restored, strict=True):
         assert torch.equal(ours.depth, other.depth) and torch.equal(ours.colour, other.colour)
+
+
+def test_view_of_a_culled_keyframe_is_left_out_also_if_no_view_is_added_later() -> None:
+    """The last keyframes of a run are culled after the last view was added."""
+    views, keyframes = StaticViews(CAMERA, 2), [keyframe(EYE, frame) for frame in range(3)]
+    for own in keyframes:
+        views.add(own, GREY, torch.ones(1, 240, 320), ALL)
+    keyframes[1].reference = 0  # culled
+    kept = [keyframes[0], keyframes[2]]
+    assert [view.keyframe for view in views] == [view.keyframe for view in views.own] == kept
+    assert len(views) == 2

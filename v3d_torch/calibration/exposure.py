@@ -19,18 +19,18 @@ def check_exposure(views: StaticViews) -> list[str]:
     """Check whether images are overexposed.
 
     Args:
-        views: Views of the keyframes; those of an earlier run, and of culled keyframes, are not checked.
+        views: Views of the keyframes; those of an earlier run are not checked.
 
     Returns:
         A list with one sentence that states when images are overexposed, or an empty list.
     """
-    active = [view for view in views.own if not view.keyframe.is_culled]
-    fractions = [float((view.colour >= _WHITE).all(dim=0).float().mean()) for view in active]
-    stamps = [view.keyframe.stamp for view, white in zip(active, fractions, strict=True) if white > _MAX_WHITE_FRACTION]
+    own = views.own
+    fractions = [float((view.colour >= _WHITE).all(dim=0).float().mean()) for view in own]
+    stamps = [view.keyframe.stamp for view, white in zip(own, fractions, strict=True) if white > _MAX_WHITE_FRACTION]
     if len(stamps) < _MIN_VIEWS:
         return []
     return [
-        f"the images of {len(stamps)} of {len(active)} keyframes, from {stamps[0]:.3f} to {stamps[-1]:.3f} s, are"
+        f"the images of {len(stamps)} of {len(own)} keyframes, from {stamps[0]:.3f} to {stamps[-1]:.3f} s, are"
         f" overexposed: up to {max(fractions):.0%} of their pixels are white and give no features, so that poses from"
         " then on can be wrong; lower the exposure of the camera"
     ]

@@ -50,7 +50,8 @@ class StaticView:
 class StaticViews:
     """Static views of keyframes, as images of a pinhole camera of lower resolution without distortion.
 
-    The images are undistorted once, here; dense reconstruction then uses the pinhole projection alone.
+    The images are undistorted once, here; dense reconstruction then uses the pinhole projection alone. Iteration,
+    ``len`` and `own` leave out the views of keyframes that were culled since; the next `append` removes them.
 
     Args:
         camera: Camera of the frames.
@@ -87,15 +88,15 @@ class StaticViews:
         self._views: list[StaticView] = []
 
     def __len__(self) -> int:
-        return len(self._views)
+        return sum(1 for _ in self)
 
     def __iter__(self) -> Iterator[StaticView]:
-        return iter(self._views)
+        return (view for view in self._views if not view.keyframe.is_culled)
 
     @property
     def own(self) -> list[StaticView]:
         """Views of this run, without those of a known map."""
-        return [view for view in self._views if not view.keyframe.is_from_earlier_run]
+        return [view for view in self if not view.keyframe.is_from_earlier_run]
 
     def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor, depth_delay: float = 0.0) -> None:
         """Store the static pixels of a keyframe as a view.
@@ -118,7 +119,7 @@ class StaticViews:
         Args:
             view: View of this camera.
         """
-        self._views = [stored for stored in self._views if not stored.keyframe.is_culled] + [view]
+        self._views = [*self, view]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the views, as live objects."""
