@@ -9,6 +9,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers.colmap_reader import read_model
@@ -206,6 +208,20 @@ def test_unsuitable_options_and_folders_are_errors(results: Path, tmp_path: Path
     )
     (copy / "request.yaml").write_text("seq: 7\n")
     assert_error_line(call(copy, "--format", "tum", "--out", tmp_path / "out"), "request.yaml: seq: input should be")
+
+
+def test_run_without_keyframes_is_exported_without_keyframes_only(results: Path, tmp_path: Path) -> None:
+    """Without keyframes as after ``run --localise``."""
+    copy, out = tmp_path / "copy", tmp_path / "out"
+    shutil.copytree(results, copy)
+    frames = pq.read_table(copy / "frames.parquet")
+    none = pa.array([False] * frames.num_rows)
+    pq.write_table(frames.set_column(frames.column_names.index("keyframe"), "keyframe", none), copy / "frames.parquet")
+    done = call(copy, "--format", "colmap", "--out", out, "--keyframes")
+    assert_error_line(done, f"{copy}: has no keyframe with a known pose; export without --keyframes")
+    assert not out.exists()
+    done = call(copy, "--format", "nerfstudio", "--out", out)
+    assert (done.exit_code, done.stdout) == (0, f"{FRAMES} images: {out}\n")
 
 
 def test_damaged_mask_is_an_error_that_names_the_file(results: Path, tmp_path: Path) -> None:

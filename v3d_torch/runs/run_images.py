@@ -89,15 +89,16 @@ def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFr
         InputError: If there is no such frame.
     """
     table = [] if run.frames is None else run.frames.select(["frame", "keyframe"]).to_pylist()
-    located = {  # broken frames have no row and no pose
-        position: row["frame"]
-        for position, (status, row) in enumerate(zip(run.metrics.status, table, strict=False))
-        if status in _LOCATED and (row["keyframe"] or not only_keyframes)
-    }
-    if not located or run.trajectory is None:
+    # Broken frames have no row and no pose.
+    rows = [position for position, status in enumerate(run.metrics.status[: len(table)]) if status in _LOCATED]
+    if not rows or run.trajectory is None:
         raise InputError(f"{run.folder}: has no frame with a known pose; run another sequence")
-    rows = list(located)
-    return LocatedFrames([*located.values()], Trajectory(run.trajectory.stamps[rows], run.trajectory.T_wc[rows]))
+    if only_keyframes:
+        rows = [position for position in rows if table[position]["keyframe"]]
+    if not rows:  # a run with --localise makes no keyframes
+        raise InputError(f"{run.folder}: has no keyframe with a known pose; export without --keyframes")
+    poses = Trajectory(run.trajectory.stamps[rows], run.trajectory.T_wc[rows])
+    return LocatedFrames([table[position]["frame"] for position in rows], poses)
 
 
 def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, masks: bool) -> Iterator[PosedImage]:
