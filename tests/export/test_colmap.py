@@ -109,6 +109,17 @@ def test_landmarks_have_tracks_colours_and_errors(model: ColmapModel) -> None:
             assert model.images[name]["points"][index][2] == number
 
 
+@pytest.mark.parametrize("name", CAMERAS)
+def test_convention_errors_are_distances_to_the_image_points_by_the_camera_model_of_colmap(
+    name: str, exports: dict[str, tuple[Path, ColmapModel]]
+) -> None:
+    model = exports[name][1]
+    for number in (1, 2, 3):
+        images = [(model.images[file], index) for file, index in model.points[number]["track"]]
+        offsets = [image["projections"][number - 1] - image["points"][index][:2] for image, index in images]
+        assert model.points[number]["error"] == pytest.approx(np.linalg.norm(offsets, axis=1).mean(), abs=2e-4)
+
+
 def test_points_of_the_map_follow_without_tracks(model: ColmapModel) -> None:
     assert sorted(model.points) == [1, 2, 3, 4, 5]
     for number in (4, 5):

@@ -65,7 +65,7 @@ def write_colmap(
     write_text(
         model / "points3D.txt",
         "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then IMAGE_ID, POINT2D_IDX of each observation\n"
-        + _landmark_lines(tracks, colours, _reprojection_errors(camera, tracks, T_cw))
+        + _landmark_lines(tracks, colours, _reprojection_errors(camera, tracks, uv, T_cw))
         + _point_lines(*points, first_id=len(tracks.points) + 1),
     )
     return len(poses)
@@ -108,11 +108,11 @@ def _colours_at(image: PosedImage, uv: Tensor) -> Tensor:
     return colour[:, v.clamp(0, colour.shape[1] - 1), u.clamp(0, colour.shape[2] - 1)].T
 
 
-def _reprojection_errors(camera: PinholeCamera, tracks: LandmarkTracks, T_cw: Tensor) -> Tensor:
-    """Return the mean reprojection error of each landmark, pixels, float64, shape (L,)."""
+def _reprojection_errors(camera: PinholeCamera, tracks: LandmarkTracks, uv: Tensor, T_cw: Tensor) -> Tensor:
+    """Return the mean distance of each landmark from its distorted image points, pixels, float64, shape (L,)."""
     T, points = T_cw[tracks.image], tracks.points[tracks.landmark]
     projected = camera.project((T[:, :3, :3] @ points[:, :, None])[..., 0] + T[:, :3, 3])
-    distances = (projected - tracks.uv).norm(dim=1)
+    distances = (camera.distort(projected) - uv).norm(dim=1)
     sums, counts = torch.zeros(2, len(tracks.points), dtype=torch.float64)
     sums.index_add_(0, tracks.landmark, distances)
     counts.index_add_(0, tracks.landmark, torch.ones_like(distances))
