@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.bag_messages import read_with_mcap
 from helpers.commands import assert_error_line
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
@@ -287,6 +288,15 @@ def test_recording_of_the_first_frames_is_not_replaced(out: Path) -> None:
     assert_error_line(done, f"{recording}: already exists; delete it, or choose another file with --rerun")
     assert recording.read_text() == "the first frames"
     assert (out / "metrics.json").read_bytes() == before and (out / CHECKPOINT).is_file()
+
+
+def test_bag_of_a_resumed_run_has_the_remaining_frames_and_its_own_odom(out: Path, tmp_path: Path) -> None:
+    done = call("--resume", out, "--bag", tmp_path / "rest.mcap")
+    assert (done.exit_code, done.stderr) == (0, "")
+    messages = read_with_mcap(tmp_path / "rest.mcap")
+    assert len(messages["/odom"]) == FRAMES - 5 and len(messages["/path"][-1][1].poses) == FRAMES
+    first = messages["/odom"][0][1].pose.pose.position
+    assert (first.x, first.y, first.z) == pytest.approx((0, 0, 0), abs=1e-9)
 
 
 def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:

@@ -36,7 +36,9 @@ _QUALITY_OF_SERVICE = {"/map": _TRANSIENT_LOCAL}
 
 
 class BagFile:
-    """Writer of a bag. Messages are written immediately; ``mcap recover`` repairs a file that was not closed.
+    """Writer of a bag.
+
+    Messages are written in blocks of a megabyte; ``mcap recover`` repairs a file that was not closed.
 
     Args:
         path: File to write; it must not exist.
