@@ -154,6 +154,20 @@ def test_few_images_without_a_partner_are_left_out(root: Path) -> None:
         ("1403636579763555584.png", 1403636579.763555584, 1403636579763555584),
         ("1403636579763555.jpg", 1403636579.763555, 1403636579763555),
         ("1403636579763.jpg", 1403636579.763, 1403636579763),
+        ("cam0_1305031102.175304.png", 1305031102.175304, 175304),
+        ("12.5.png", 12.5, 5),
+        ("0012.5.png", 12.5, 5),
+        ("rgb_0.033.png", 0.033, 33),
+        ("2026-01-01_10-30-59.70.png", 1767263459.7, 70),
+        ("rgb 2026-01-01 10:30:59.700123.png", 1767263459.700123, 700123),
+        ("20260101_103059.9.png", 1767263459.9, 9),
+        ("2026010110305970.png", 1767263459.7, 2026010110305970),
+        ("PXL_20260101_103059700.jpg", 1767263459.7, 103059700),
+        ("20260101_103059.jpg", 1767263459, 103059),
+        ("20260101_103059_0001.jpg", None, 1),
+        ("2026-13-01_10-30-59.70.png", None, 70),
+        ("10-30-59.70.png", None, 70),
+        ("shot_010.0008.png", None, 8),
         ("000120.png", None, 120),
         ("frame-000120.color.png", None, 120),
         ("rgb.png", None, None),
@@ -220,6 +234,35 @@ def test_names_in_nanoseconds_since_the_start_of_the_computer_are_rejected(root:
     ):
         load_sequence(str(root))
     assert load_sequence(str(root), options=FPS).stamps.tolist() == pytest.approx([0, 0.1, 0.2])
+
+
+def test_dates_and_times_as_names_are_in_order_across_a_minute(root: Path) -> None:
+    names = ["2026-01-01_10-30-59.80.png", "2026-01-01_10-30-59.90.png", "2026-01-01_10-31-00.00.png"]
+    fill(root, [f"rgb/{name}" for name in names], [f"depth/{name}" for name in names])
+    assert_frames(load_sequence(str(root)), [1767263459.8, 1767263459.9, 1767263460.0], [(i, i) for i in range(3)])
+
+
+def test_frame_numbers_after_a_dot_are_in_numerical_order(root: Path) -> None:
+    names = [f"shot_010.{i}.png" for i in (8, 9, 10)]
+    fill(root, [f"rgb/{name}" for name in names], [f"depth/{name}" for name in names])
+    assert_frames(load_sequence(str(root), options=FPS), [0, 0.1, 0.2], [(i, i) for i in range(3)])
+    with pytest.raises(InputError, match=r"file names such as shot_010\.8\.png are not timestamps; .*--fps"):
+        load_sequence(str(root))
+
+
+@pytest.mark.parametrize("rate", [90, 300])
+def test_high_frame_rates_are_accepted(root: Path, rate: int) -> None:
+    names = [f"{5 + i / rate:.6f}.png" for i in range(4)]
+    fill(root, [f"rgb/{name}" for name in names], [f"depth/{name}" for name in names])
+    assert len(load_sequence(str(root))) == 4
+
+
+def test_names_that_are_less_than_a_millisecond_apart_are_not_timestamps(root: Path) -> None:
+    names = [f"10.{i:04d}.png" for i in range(8, 12)]
+    fill(root, [f"rgb/{name}" for name in names], [f"depth/{name}" for name in names])
+    with pytest.raises(InputError, match=r"mine: the images are 0\.0001 s apart .*; .*, or pass .* --fps"):
+        load_sequence(str(root))
+    assert load_sequence(str(root), options=FPS).stamps.tolist() == pytest.approx([0, 0.1, 0.2, 0.3])
 
 
 def test_image_folder_without_camera_and_file_instead_of_folder_are_rejected(root: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 
 from v3d_torch.datasets.depth_files import DEPTH_SUFFIXES
@@ -16,6 +17,16 @@ SUFFIXES = DEPTH_SUFFIXES | {".png", ".jpg", ".jpeg", ".bmp", ".ppm", ".pgm", ".
 
 _PARTS = re.compile(r"(\D*)(\d*)")
 """Text and number parts of a name, for sorting."""
+
+_DATE_TIME = re.compile(r"(?<!\d)(20\d\d)-?(\d\d)-?(\d\d)[ T_-]?(\d\d)[:._-]?(\d\d)[:._-]?(\d\d)(?:\.?(\d+))?$")
+"""Date, time and fraction of a second at the end of a name. Counts since 1970 begin with 20 from the year 2033 on."""
+
+_SECONDS = re.compile(r"(?:^|(?<!\d)(?=\d{10}\.)|^\D+(?=0\.|[1-9]))(\d+\.\d+)$")
+"""Seconds at the end of a name. After other numbers, only seconds since 1970: the ``59.70`` of ``10-30-59.70`` is part
+of a time. After text, no leading zeros: ``shot_010.0008`` is frame 8 of a shot."""
+
+_COUNT_SINCE_1970 = re.compile(r"(?<!\d)(\d{13}|\d{16}|\d{19})$")
+"""Milli-, micro- or nanoseconds since 1970 at the end of a name."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -31,12 +42,15 @@ def frame_number(path: Path) -> int | None:
 
 
 def stamp_in_name(path: Path) -> float | None:
-    """Timestamp in a file name such as ``1305031102.175304.png`` or ``1403636579763555584.png``, seconds; else None."""
-    if match := re.search(r"(?<!\d)(\d+\.\d+)$", path.stem):
-        return parse_timestamp(match[1])
-    if match := re.search(r"(?<!\d)(\d{13}|\d{16}|\d{19})$", path.stem):  # milli-, micro-, nanoseconds since 1970
-        return parse_timestamp(match[1])
-    return None
+    """Timestamp at the end of a file name, seconds; None if there is none.
+
+    Known are seconds with a fraction (``1305031102.175304.png``), milli-, micro- and nanoseconds since 1970
+    (``1403636579763555584.png``), and dates with times (``2026-01-01_10-30-59.70.png``), which are taken as UTC.
+    """
+    if (match := _DATE_TIME.search(path.stem)) and (seconds := _since_1970(match)) is not None:
+        return seconds
+    match = _SECONDS.search(path.stem) or _COUNT_SINCE_1970.search(path.stem)
+    return parse_timestamp(match[1]) if match else None
 
 
 def pair_by_number(folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float) -> list[ImagePair]:
@@ -64,3 +78,13 @@ def pair_by_number(folder: Path, colour: Iterable[Path], depth: Iterable[Path], 
     return [
         ImagePair(number / rate, *(str(files[number].relative_to(folder)) for files in by_number)) for number in numbers
     ]
+
+
+def _since_1970(match: re.Match[str]) -> float | None:
+    """Seconds from 1970 to a match of `_DATE_TIME`; None if it is no valid date and time."""
+    year, month, day, hour, minute, second = (int(digits) for digits in match.groups()[:6])
+    try:
+        whole = datetime(year, month, day, hour, minute, second, tzinfo=UTC).timestamp()
+    except ValueError:
+        return None
+    return whole + float(f"0.{match[7] or 0}")

@@ -25,6 +25,9 @@ _MAX_GAP = 10.0
 """Maximum median time between images, seconds. Images farther apart cannot be tracked; timestamps in milliseconds at
 30 Hz exceed this limit."""
 
+_MIN_GAP = 0.001
+"""Minimum median time between images, seconds: no RGB-D camera has 1000 Hz, so smaller gaps are not in seconds."""
+
 MAX_STAMP_DIFFERENCE = 0.02
 """Maximum difference between the timestamps of a colour and a depth image of one frame, seconds: the default of the
 TUM benchmark's association tool."""
@@ -156,9 +159,17 @@ def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
     """Check that the time between images is plausible for timestamps in seconds.
 
     Raises:
-        InputError: If the images are so far apart that the timestamps must be in another unit.
+        InputError: If the images are so far apart, or so close to each other, that the timestamps must be in another
+            unit.
     """
-    gap = median(later.stamp - earlier.stamp for earlier, later in pairwise(pairs)) if len(pairs) > 1 else 0.0
+    if len(pairs) < 2:
+        return
+    gap = median(later.stamp - earlier.stamp for earlier, later in pairwise(pairs))
+    if gap < _MIN_GAP:
+        raise InputError(
+            f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps to"
+            " seconds, or pass the frame rate with --fps if file names only look like timestamps"
+        )
     if gap > _MAX_GAP:
         raise InputError(
             f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps to"
