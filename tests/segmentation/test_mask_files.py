@@ -82,6 +82,25 @@ def test_files_named_by_timestamp_belong_to_the_nearest_frame(tmp_path: Path) ->
         masks(frame(9, 5.075))
 
 
+@pytest.mark.parametrize("name", ["{:.0f}", "mask_{:.0f}"])
+def test_names_in_nanoseconds_belong_to_the_nearest_frame(tmp_path: Path, name: str) -> None:
+    start = 1_403_636_579.763555
+    for value in (1, 2, 3):
+        Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{name.format((start + value / 30) * 1e9)}.png")
+    masks = MaskFolder(tmp_path)
+    masks.check_number(2)
+    assert [masks.read(frame(i, start + value / 30))[1].tolist() for i, value in enumerate((1, 3))] == [[1], [3]]
+
+
+def test_other_names_need_one_file_for_each_frame(tmp_path: Path) -> None:
+    for value in (1, 2, 3):
+        Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{value:06d}.png")
+    masks = MaskFolder(tmp_path)
+    masks.check_number(3)
+    with pytest.raises(InputError, match="has 3 id images for 2 frames, and their names are not timestamps; name each"):
+        masks.check_number(2)
+
+
 def test_files_with_other_names_belong_to_frames_in_order(tmp_path: Path) -> None:
     for value in (1, 2):
         Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{value:06d}.png")

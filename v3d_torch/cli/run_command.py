@@ -33,7 +33,7 @@ from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runtime.stage_import import first_not_given
-from v3d_torch.segmentation import make_segmenter
+from v3d_torch.segmentation import MaskFolder, make_segmenter
 from v3d_torch.viz.viewer import make_viewer
 
 
@@ -162,6 +162,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if request.load_map is not None and checkpoint is None:  # a checkpoint contains the map
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
+    if isinstance(segment, MaskFolder) and isinstance(sequence, Sized) and checkpoint is None:
+        segment.check_number(len(sequence))
     viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
     if masks is not None and masks.resolve() == (folder / "masks").resolve():

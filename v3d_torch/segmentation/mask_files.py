@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from v3d_torch.datasets.image_files import list_images
+from v3d_torch.datasets.image_files import list_images, stamp_in_name
 from v3d_torch.errors import InputError
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.safe_yaml import parse_yaml
@@ -28,15 +27,14 @@ _MAX_INSTANCES = 255
 """Maximum number of instances in an image. A depth image that is read as an id image has thousands of values, each of
 which would become a mask of full size."""
 
-_STAMP = re.compile(r"\d+\.\d+")
-
 
 class MaskFolder:
     """Instances from id images: single-channel PNG files, 8 or 16 bit, 0 = background, other values = instance ids.
 
-    Files named by timestamp (``1305031102.175304.png``) belong to the nearest frame in time, at most 0.02 s away. Files
-    with other names belong to the frames in the order of their names, in which numbers are compared as numbers: 9.png
-    comes before 10.png.
+    If all names end in a timestamp such as ``1305031102.175304.png`` (`stamp_in_name`), a file belongs to the nearest
+    frame in time, at most 0.02 s away. Files with other names belong to the frames in the order of their names, in
+    which numbers are compared as numbers: 9.png comes before 10.png. `check_number` checks that there is one for each
+    frame.
 
     A file ``labels.yaml`` in the folder gives the COCO class of each id, a line ``4: chair`` for each; ids that it does
     not list are no instances. Without this file, all instances are people.
@@ -57,9 +55,28 @@ class MaskFolder:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
         labels = folder / "labels.yaml"
         self._labels = _read_labels(labels) if labels.is_file() else None
+        stamps = [stamp for path in self._paths if (stamp := stamp_in_name(path)) is not None]
         self._stamps: Tensor | None = None
-        if all(_STAMP.fullmatch(path.stem) for path in self._paths):
-            self._stamps = torch.tensor([float(path.stem) for path in self._paths], dtype=torch.float64)
+        if len(stamps) == len(self._paths):
+            self._stamps = torch.tensor(stamps, dtype=torch.float64)
+
+    def check_number(self, frames: int) -> None:
+        """Check that files without timestamps in their names can belong to the frames in order.
+
+        A sequence has fewer frames than colour images if images have no partner, so that files made from all colour
+        images would belong to the wrong frames.
+
+        Args:
+            frames: Number of frames of the sequence.
+
+        Raises:
+            InputError: If the number of files is another one.
+        """
+        if self._stamps is None and len(self._paths) != frames:
+            raise InputError(
+                f"{self.folder}: has {len(self._paths)} id images for {frames} frames, and their names are not"
+                " timestamps; name each one by the timestamp of its frame, or write one for each frame"
+            )
 
     def __call__(self, frame: RGBDFrame) -> Instances:
         """Return the instances of a frame in the order of their ids, each with the score 1.

@@ -142,7 +142,7 @@ CASES = [
     Case("folder with unrelated files", write("../out/thesis.tex", ""), Succeeds()),
     Case(
         "id images in the folder of the saved masks",
-        all_of(write("../out/masks/1.png", ""), add_options("--segmenter", "masks", "--masks", "{out}/masks")),
+        all_of(write("../out/masks/1.0.png", ""), add_options("--segmenter", "masks", "--masks", "{out}/masks")),
         Fails("{out}/masks: would be written while it is read; choose another folder with --out"),
     ),
     Case("empty folder", lambda place: place.out.mkdir(), Succeeds()),

@@ -99,10 +99,9 @@ CASES = [
     Case(
         "too few numbered id images",
         masks(lambda i: ids(1), ["0", "1", "2"]),
-        fails_at_frame(
-            3,
-            "{seq}/ids: has no id image for frame 3 at 1305031102.300000 s; add it, or name the folder that"
-            " belongs to this sequence",
+        Fails(
+            f"{{seq}}/ids: has 3 id images for {FRAMES} frames, and their names are not timestamps; name each one by"
+            " the timestamp of its frame, or write one for each frame"
         ),
     ),
     Case(
