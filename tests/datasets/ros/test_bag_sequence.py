@@ -245,6 +245,13 @@ def test_unregistered_depth_is_rejected_unless_name_or_user_confirms_it(tmp_path
     assert len(load_sequence(str(write_with_other_depth(tmp_path / "aligned", frame="/depth_frame")))) == 3
 
 
+def test_registered_depth_of_another_camera_is_rejected(tmp_path: Path) -> None:
+    """The name of a topic says that depth is registered to colour, but not to that of which camera."""
+    path = write_with_other_depth(tmp_path, topic="/other/aligned_depth_to_color/image_raw", frame="/other_frame")
+    with pytest.raises(InputError, match=r"in frame other_frame, colour in frame optical; .*--depth-topic"):
+        load_sequence(str(path))
+
+
 def test_depth_of_another_size_is_an_input_error(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=f"{DEPTH}: has 40x24 pixels, but its colour image has 32x24; choose depth registered"

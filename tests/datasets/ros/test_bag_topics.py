@@ -33,6 +33,18 @@ COMPRESSED_ONLY = {
     "/d400/aligned_depth_to_color/image_raw/compressedDepth": COMPRESSED,
     "/t265/fisheye1/image_raw": IMAGE,
 }
+OPENNI = {
+    "/camera/rgb/image_raw": IMAGE,
+    "/camera/rgb/camera_info": CAMERA_INFO,
+    "/camera/depth/image_raw": IMAGE,
+    "/camera/depth_registered/image_raw": IMAGE,
+}
+AZURE = {
+    "/rgb/image_raw": IMAGE,
+    "/rgb/camera_info": CAMERA_INFO,
+    "/depth/image_raw": IMAGE,
+    "/depth_to_rgb/image_raw": IMAGE,
+}
 UNLABELLED = {"/sim/image": IMAGE, "/sim/camera_info": CAMERA_INFO, "/sim/depth": IMAGE}
 
 
@@ -52,6 +64,8 @@ UNLABELLED = {"/sim/image": IMAGE, "/sim/camera_info": CAMERA_INFO, "/sim/depth"
             "/d400/aligned_depth_to_color/image_raw/compressedDepth",
             "/d400/color/camera_info",
         ),
+        (OPENNI, "/camera/rgb/image_raw", "/camera/depth_registered/image_raw", "/camera/rgb/camera_info"),
+        (AZURE, "/rgb/image_raw", "/depth_to_rgb/image_raw", "/rgb/camera_info"),
         (UNLABELLED, "/sim/image", "/sim/depth", "/sim/camera_info"),
     ],
 )
@@ -70,6 +84,17 @@ def test_choice_between_two_cameras_is_an_error_until_the_user_names_one() -> No
     assert (topics.depth, topics.info) == ("/right/camera/depth/image", "/right/camera/rgb/camera_info")
     topics = choose_topics("bag", types, "/right/camera/rgb/image_color", "/left/camera/depth/image")
     assert topics.depth == "/left/camera/depth/image"
+
+
+def test_depth_of_the_same_camera_is_preferred_to_registered_depth_of_another() -> None:
+    types = {"/front/color/image_raw": IMAGE, "/front/aligned_depth_to_color/image_raw": IMAGE}
+    types |= {"/rear/color/image_raw": IMAGE, "/rear/depth/image_raw": IMAGE}
+    assert choose_topics("bag", types, rgb="/rear/color/image_raw").depth == "/rear/depth/image_raw"
+    topics = choose_topics("bag", types, rgb="/front/color/image_raw")
+    assert topics.depth == "/front/aligned_depth_to_color/image_raw" and topics.is_registered
+    del types["/rear/depth/image_raw"]
+    topics = choose_topics("bag", types, rgb="/rear/color/image_raw")
+    assert topics.depth == "/front/aligned_depth_to_color/image_raw" and not topics.is_registered
 
 
 def test_colour_is_found_next_to_a_depth_topic_of_any_name() -> None:

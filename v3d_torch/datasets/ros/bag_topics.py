@@ -42,8 +42,8 @@ class BagTopics:
 
     @property
     def is_registered(self) -> bool:
-        """True if the name of the depth topic implies that depth is registered to colour, pixel by pixel."""
-        return bool(_REGISTERED.search(self.depth))
+        """True if the topic names imply that depth is registered to colour, pixel by pixel, of the same camera."""
+        return bool(_REGISTERED.search(self.depth)) and _shared_parts(self.depth, self.rgb) > 0
 
 
 def choose_topics(
@@ -55,7 +55,7 @@ def choose_topics(
         bag: Path of the bag, for error messages.
         types: Message type of each topic.
         rgb: Colour topic chosen by the user; None to prefer raw images to rectified and compressed ones.
-        depth: Depth topic chosen by the user; None to prefer depth registered to colour, then depth of the same camera.
+        depth: Depth topic chosen by the user; None to prefer depth of the same camera, then depth registered to colour.
         info: CameraInfo topic chosen by the user; None for the one next to the colour topic.
 
     Returns:
@@ -81,7 +81,7 @@ def choose_topics(
         rgb = _choose_best(bag, "colour", "rgb", rgb_ranks, images)
     if depth is None:
         depth_ranks = {
-            topic: (not _REGISTERED.search(topic), -_shared_prefix(topic, rgb), _compression_rank(topic, images))
+            topic: (-_shared_parts(topic, rgb), not _REGISTERED.search(topic), _compression_rank(topic, images))
             for topic in candidates
             if _DEPTH.search(topic) and topic != rgb
         }
@@ -111,9 +111,9 @@ def _compression_rank(topic: str, images: Mapping[str, str]) -> int:
     return 0 if images[topic] == IMAGE else 1 if topic.endswith("compressedDepth") else 2
 
 
-def _shared_prefix(topic: str, other: str) -> int:
+def _shared_parts(topic: str, other: str) -> int:
     """Number of leading name parts that two topics share; topics of one camera share most."""
-    pairs = zip(topic.split("/"), other.split("/"), strict=False)
+    pairs = zip(topic.strip("/").split("/"), other.strip("/").split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
