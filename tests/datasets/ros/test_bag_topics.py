@@ -97,6 +97,21 @@ def test_depth_of_the_same_camera_is_preferred_to_registered_depth_of_another() 
     assert topics.depth == "/front/aligned_depth_to_color/image_raw" and not topics.is_registered
 
 
+@pytest.mark.parametrize(
+    ("rgb", "is_rectified"),
+    [
+        ("/camera/rgb/image_rect_color", True),
+        ("/camera/rgb/rectified", True),
+        ("/camera/rgb/image_raw", False),
+        ("/direct/rgb/image_raw", False),
+        ("/camera/rgb/image_corrected", False),
+    ],
+)
+def test_word_in_the_name_implies_rectified_images(rgb: str, is_rectified: bool) -> None:
+    types = {rgb: IMAGE, "/camera/depth/image": IMAGE}
+    assert choose_topics("bag", types).is_rectified == is_rectified
+
+
 def test_colour_is_found_next_to_a_depth_topic_of_any_name() -> None:
     types = {"/a": IMAGE, "/b": IMAGE}
     assert choose_topics("bag", types, depth="/a").rgb == "/b"

@@ -18,7 +18,8 @@ _DEPTH = re.compile(r"depth", re.IGNORECASE)
 _REGISTERED = re.compile(r"aligned|registered|depth_to_(rgb|colou?r)", re.IGNORECASE)
 _NEITHER = re.compile(r"infra|/ir\d?/|fisheye|mask|label|segment|theora|confidence", re.IGNORECASE)
 """Names of images that are neither colour nor depth, or that cannot be decoded here (theora)."""
-_RECTIFIED = re.compile(r"rect", re.IGNORECASE)
+_RECTIFIED = re.compile(r"(?<![a-z])rect", re.IGNORECASE)
+"""Start of a word: other words, such as ``direct`` and ``corrected``, contain the same letters."""
 
 
 @dataclass(frozen=True)
