@@ -42,6 +42,20 @@ def test_depth_in_metres_is_read_exactly(tmp_path: Path, suffix: str) -> None:
     assert depth.dtype == np.float32 and np.array_equal(depth, METRES) and is_depth_file(path)
 
 
+@pytest.mark.parametrize("maximum", [4095, 65535])
+@pytest.mark.parametrize("kind", ["P5", "P2"])
+def test_values_of_a_pgm_image_are_not_scaled(tmp_path: Path, kind: str, maximum: int) -> None:
+    units = np.linspace(0, maximum, HEIGHT * WIDTH).astype(np.uint16).reshape(HEIGHT, WIDTH)
+    pixels = units.astype(">u2").tobytes() if kind == "P5" else " ".join(map(str, units.flatten())).encode()
+    path = tmp_path / "depth.pgm"
+    path.write_bytes(f"{kind}\n# depth\n{WIDTH} {HEIGHT}\n{maximum}\n".encode() + pixels)
+    depth = read_depth_file(path)
+    assert depth.dtype == np.uint16 and np.array_equal(depth, units)
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"depth\.pgm: is truncated or damaged"):
+        read_depth_file(path)
+
+
 @pytest.mark.parametrize("layout", ["folder", "TUM"])
 @pytest.mark.parametrize("suffix", WRITERS)
 def test_sequence_with_depth_in_metres_is_read(tmp_path: Path, suffix: str, layout: str) -> None:

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
 
+import cv2
 import numpy as np
 import simplejpeg
 import torch
@@ -73,7 +74,7 @@ def decode_colour(content: bytes, source: object) -> Tensor:
 
 
 def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
-    """Decode a depth image. 16-bit PNG is decoded without the GIL, other formats by Pillow.
+    """Decode a depth image. 16-bit PNG is decoded without the GIL, PGM by OpenCV, other formats by Pillow.
 
     Args:
         content: Bytes of the file of an image with 16 or 32 bits per pixel.
@@ -87,7 +88,7 @@ def decode_depth(content: bytes, source: object) -> NDArray[np.generic]:
     """
     pixels = _decode_common(content)
     if pixels is None or pixels.dtype != np.uint16:
-        return _decode_depth_with_pillow(BytesIO(content), source)
+        return _decode_other_depth(content, source)
     return pixels[..., 0]
 
 
@@ -150,8 +151,10 @@ def _decode_colour_with_pillow(file: Path | BytesIO, source: object) -> NDArray[
         return np.array(image.convert("RGB"))
 
 
-def _decode_depth_with_pillow(file: Path | BytesIO, source: object) -> NDArray[np.generic]:
-    with _decode(file, source) as image:
+def _decode_other_depth(content: bytes, source: object) -> NDArray[np.generic]:
+    with _decode(BytesIO(content), source) as image:
+        if image.format == "PPM" and image.mode == "I":
+            return _decode_pgm(content, source)
         if _is_depth_mode(image.mode):
             return np.array(image)
         if image.mode in ("L", "1", "P"):
@@ -159,6 +162,15 @@ def _decode_depth_with_pillow(file: Path | BytesIO, source: object) -> NDArray[n
         raise InputError(
             f"{source}: is a colour image, expected a depth image; check that colour and depth are not swapped"
         )
+
+
+def _decode_pgm(content: bytes, source: object) -> NDArray[np.generic]:
+    """Decode a 16-bit PGM image by OpenCV: Pillow scales the values so that the maximum in the header becomes 65535."""
+    # A newline is needed after the last number of a text.
+    pixels: NDArray[np.generic] | None = cv2.imdecode(np.frombuffer(content + b"\n", np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise _damaged_error(source)
+    return pixels
 
 
 def _decode(file: Path | BytesIO, source: object) -> Image.Image:
@@ -173,7 +185,7 @@ def _decode(file: Path | BytesIO, source: object) -> Image.Image:
         image.load()
     except Exception as error:  # on invalid data a decoder can raise any exception
         image.close()
-        raise InputError(f"{source}: is truncated or damaged; copy or download it again") from error
+        raise _damaged_error(source) from error
     return image
 
 
@@ -195,7 +207,7 @@ def _read_header(file: Path | BytesIO, source: object) -> Image.Image:
     except Image.DecompressionBombError as error:
         raise too_large_error(source) from error
     except Exception as error:  # on invalid data a decoder can raise any exception
-        raise InputError(f"{source}: is truncated or damaged; copy or download it again") from error
+        raise _damaged_error(source) from error
     if image.width * image.height > MAX_PIXELS:
         image.close()
         raise too_large_error(source)
@@ -226,3 +238,7 @@ def too_large_error(source: object) -> InputError:
     return InputError(
         f"{source}: has more than {MAX_PIXELS >> 20} million pixels according to its header; copy or export it again"
     )
+
+
+def _damaged_error(source: object) -> InputError:
+    return InputError(f"{source}: is truncated or damaged; copy or download it again")
