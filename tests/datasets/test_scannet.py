@@ -88,6 +88,17 @@ def test_colour_of_the_depth_size_is_unchanged(folder: Path) -> None:
     assert np.array_equal(load_sequence(str(folder))[0].image.permute(1, 2, 0).numpy(), colour_of(0, *SIZE))
 
 
+def test_resized_colour_images_need_the_camera_of_their_size(folder: Path) -> None:
+    for path in (folder / "color").iterdir():
+        save(path, colour_of(0, 64, 48))
+    message = r"intrinsic_color\.txt: the principal point \(131, 97\) is far from the centre of the 64x48 images; give"
+    with pytest.raises(InputError, match=message):
+        load_sequence(str(folder))[0]
+    (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
+    with pytest.raises(InputError, match=message):
+        load_sequence(str(folder))
+
+
 def test_missing_depth_camera_is_derived_from_colour_camera(folder: Path) -> None:
     (folder / "intrinsic" / "intrinsic_depth.txt").unlink()
     camera = load_sequence(str(folder)).camera

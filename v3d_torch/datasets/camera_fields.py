@@ -100,6 +100,26 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
     return camera
 
 
+def check_principal_point(cx: float, cy: float, size: tuple[int, int], source: object) -> None:
+    """Check that the principal point is that of images of a given size: resized images have another one.
+
+    Args:
+        cx: Column of the principal point, pixels.
+        cy: Row of the principal point, pixels.
+        size: Width and height of the images.
+        source: Origin of the camera, for messages.
+
+    Raises:
+        InputError: If the principal point is far from the centre of the images.
+    """
+    width, height = size
+    if abs(cx - width / 2) > width / 4 or abs(cy - height / 2) > height / 4:
+        raise InputError(
+            f"{source}: the principal point ({cx:g}, {cy:g}) is far from the centre of the {width}x{height} images;"
+            " give the camera of these images, not of a larger or smaller size"
+        )
+
+
 def check_distortion(camera: PinholeCamera, source: object) -> None:
     """Check that undistortion inverts distortion at the image corners, where invalid coefficients fold rays back.
 

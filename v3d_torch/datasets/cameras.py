@@ -11,7 +11,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from v3d_torch.datasets.camera_fields import camera_from_fields, check_distortion
+from v3d_torch.datasets.camera_fields import camera_from_fields, check_distortion, check_principal_point
 from v3d_torch.datasets.camera_formats import fields_from_numbers, fields_from_yaml
 from v3d_torch.datasets.sequence_names import canonical_name
 from v3d_torch.errors import InputError
@@ -169,10 +169,5 @@ def _complete(fields: dict[str, Any], source: str, image_size: ImageSize | None)
     camera = camera_from_fields(fields | {"width": width, "height": height}, source)
     if image_size is None:
         return camera
-    # Images of another size than that of the calibration have another principal point.
-    if abs(camera.cx - width / 2) > width / 4 or abs(camera.cy - height / 2) > height / 4:
-        raise InputError(
-            f"{source}: the principal point ({camera.cx:g}, {camera.cy:g}) is far from the centre of the"
-            f" {width}x{height} images; give the camera of these images, not of a larger or smaller size"
-        )
+    check_principal_point(camera.cx, camera.cy, (width, height), source)
     return camera

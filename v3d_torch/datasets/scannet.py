@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.camera_fields import camera_from_fields
+from v3d_torch.datasets.camera_fields import camera_from_fields, check_principal_point
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
 from v3d_torch.datasets.images import image_size
@@ -57,7 +57,7 @@ class ScanNetSequence(PairedImages):
             depth_scale=_DEPTH_SCALE,
             name=folder.resolve().name,
         )
-        colour = _intrinsics_file(frames, "color")
+        self._colour_camera = colour = _intrinsics_file(frames, "color")
         self._K_colour = _read_camera_matrix(colour)[:3, :3] if colour is not None else None
 
     @staticmethod
@@ -73,6 +73,8 @@ class ScanNetSequence(PairedImages):
             return colour
         K_depth = self.camera.K.numpy()
         K_colour = self._K_colour if self._K_colour is not None else _scale(K_depth, width / size[0], height / size[1])
+        if self._colour_camera is not None:
+            check_principal_point(K_colour[0, 2], K_colour[1, 2], (width, height), self._colour_camera)
         # First average down to about the depth resolution, to avoid aliasing of fine texture. Then warp by fractions of
         # a pixel, so that the pixels of both images have the same rays.
         shrink = K_depth.diagonal()[:2] / K_colour.diagonal()[:2]
@@ -111,6 +113,7 @@ def _depth_camera(frames: Path, pair: ImagePair) -> PinholeCamera | None:
     K = _read_camera_matrix(source)
     if source == _intrinsics_file(frames, "color"):
         colour_size = image_size(frames / pair.colour)
+        check_principal_point(K[0, 2], K[1, 2], colour_size, source)
         K = _scale(K, width / colour_size[0], height / colour_size[1])
     fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
     return camera_from_fields(fields | {"depth_scale": _DEPTH_SCALE}, str(source))
