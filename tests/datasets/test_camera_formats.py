@@ -65,6 +65,26 @@ def test_values_that_other_programs_do_not_state_can_be_added(tmp_path: Path, te
     assert {name: getattr(camera, name) for name in added} == added
 
 
+@pytest.mark.parametrize(
+    "name", ["dist_coeffs", "distCoeffs", "dist_coeff", "distortion_coeffs", "distortion", "dist", "D"]
+)
+def test_distortion_is_read_under_all_usual_names(tmp_path: Path, name: str) -> None:
+    assert load(tmp_path, ROS.replace("distortion_coefficients", name)) == CAMERA
+
+
+@pytest.mark.parametrize("name", ["distortion_parameters", "dist_vector"])
+def test_distortion_under_another_name_is_rejected(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match=rf"camera\.yaml: has an unknown key {name}; name .* distortion_coefficients"):
+        load(tmp_path, ROS.replace("distortion_coefficients", name))
+
+
+def test_matrices_with_a_list_for_each_row_are_read(tmp_path: Path) -> None:
+    camera = replace(CAMERA, depth_scale=1000)
+    rows = f"[[{camera.fx}, 0, {camera.cx}], [0, {camera.fy}, {camera.cy}], [0, 0, 1]]"
+    text = f"camera_matrix: {rows}\ndist_coeff: [{list(LENS)}]\nimage_width: 640\nimage_height: 480\n"
+    assert load(tmp_path, text + "depth_scale: 1000\n") == camera
+
+
 def test_several_messages_of_a_topic_are_one_camera(tmp_path: Path) -> None:
     assert load(tmp_path, 3 * ROS_TOPIC) == CAMERA
 

@@ -20,6 +20,9 @@ _OWN_KEYS = ("depth_scale", "readout", "depth_delay", "inverse_depth_offset")
 
 _KALIBR_CAMERA = re.compile(r"cam\d+")
 
+_LENS_KEYS = ("distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distortion", "dist", "d")
+"""Names of the distortion coefficients in files of ROS and OpenCV, see `_plain`."""
+
 
 def fields_from_yaml(tree: Mapping[Any, Any], source: str) -> Fields | None:
     """Return the fields of a camera in a YAML file of another program.
@@ -32,7 +35,7 @@ def fields_from_yaml(tree: Mapping[Any, Any], source: str) -> Fields | None:
         Fields, which can lack the size of the images; None if the file has none of the known formats.
 
     Raises:
-        InputError: If the file contains several cameras, or is incomplete.
+        InputError: If the file contains several cameras, is incomplete, or names the distortion in an unknown way.
     """
     names = {str(key) for key in tree}
     keys = {_plain(key): value for key, value in tree.items()}
@@ -49,6 +52,7 @@ def fields_from_yaml(tree: Mapping[Any, Any], source: str) -> Fields | None:
         if "intrinsics" in names and "resolution" in names:
             return _kalibr(tree, source) | own
         if "cameramatrix" in keys or ("k" in keys and "width" in keys):
+            _check_lens_keys(tree, source)
             return _ros(keys) | own
     except (AttributeError, KeyError, IndexError, TypeError, ValueError) as error:
         raise InputError(f"{source}: is an incomplete camera file ({_describe(error)}); export it again") from error
@@ -120,7 +124,7 @@ def _kalibr(camera: Mapping[str, Any], source: str) -> Fields:
 def _ros(keys: Mapping[str, Any]) -> Fields:
     """Fields of a ``CameraInfo`` of ROS or a calibration of OpenCV; keys in lower case without underscores."""
     K = _numbers(keys.get("cameramatrix", keys.get("k")))
-    D = _numbers(next((keys[name] for name in ("distortioncoefficients", "distcoeffs", "d") if name in keys), []))
+    D = _numbers(next((keys[name] for name in _LENS_KEYS if name in keys), []))
     fields: Fields = {"fx": K[0], "fy": K[4], "cx": K[2], "cy": K[5]}
     for name in ("width", "height"):
         if (value := keys.get(f"image{name}", keys.get(name))) is not None:
@@ -129,13 +133,25 @@ def _ros(keys: Mapping[str, Any]) -> Fields:
     return fields | {"distortion": D, "distortion_model": str(model or "")}
 
 
+def _check_lens_keys(tree: Mapping[Any, Any], source: str) -> None:
+    """Check that no key with an unknown name can be the distortion, which would be ignored."""
+    known = (*_LENS_KEYS, "distortionmodel")
+    unknown = next((key for key in tree if re.match("dist(?!ance)", _plain(key)) and _plain(key) not in known), None)
+    if unknown is not None:
+        raise InputError(
+            f"{source}: has an unknown key {unknown}; name the coefficients of the lens distortion_coefficients, and"
+            " its model distortion_model"
+        )
+
+
 def _plain(key: object) -> str:
     return str(key).lower().replace("_", "")
 
 
 def _numbers(node: Any) -> list[float]:
-    """Numbers of a list, or of a matrix with the key ``data``."""
-    return [_number(value) for value in (node["data"] if isinstance(node, Mapping) else node)]
+    """Numbers of a list, of a list of rows, or of a matrix with the key ``data``."""
+    rows = node["data"] if isinstance(node, Mapping) else node
+    return [_number(value) for row in rows for value in (row if isinstance(row, list) else [row])]
 
 
 def _number(value: Any) -> float:
