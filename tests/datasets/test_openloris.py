@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
+from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of, save
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.datasets import load_sequence
@@ -100,6 +100,8 @@ def test_camera_chosen_by_user_replaces_sensors_file(folder: Path) -> None:
     (folder / "sensors.yaml").write_text("%YAML:1.0\nnothing: 1\n")
     own = PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=2000)
     assert load_sequence(str(folder), camera=own).camera is own
+    (folder / "camera.yaml").write_text(CAMERA_YAML)
+    assert load_sequence(str(folder)).camera == PinholeCamera(30, 31, 15.5, 11.5, WIDTH, HEIGHT, depth_scale=1000)
 
 
 @pytest.mark.parametrize(

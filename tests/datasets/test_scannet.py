@@ -111,6 +111,14 @@ def test_missing_depth_camera_is_derived_from_colour_camera(folder: Path) -> Non
     assert own[0].image.shape == (3, 96, 128)
 
 
+@pytest.mark.parametrize("place", [".", "frames"])
+def test_camera_file_beside_the_images_or_in_the_scene_is_preferred(folder: Path, place: str) -> None:
+    folder = folder.rename(folder.with_name("frames")).parent
+    (folder / "frames" / "intrinsic" / "intrinsic_depth.txt").write_text("a b c\n")
+    (folder / place / "K.txt").write_text(f"100 101 64 48 {SIZE[0]} {SIZE[1]}\n")
+    assert load_sequence(str(folder)).camera == PinholeCamera(100, 101, 64, 48, *SIZE, depth_scale=1000)
+
+
 def test_sequence_without_finite_poses_has_no_ground_truth(folder: Path) -> None:
     for path in (folder / "pose").iterdir():
         path.write_text(LOST)

@@ -59,7 +59,7 @@ class BonnSequence(TUMSequence):
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
-        super().__init__(folder, camera, published=CAMERA)
+        super().__init__(folder, camera, published=lambda: CAMERA)
         if self.groundtruth is not None:
             self.groundtruth = camera_poses(self.groundtruth)
 

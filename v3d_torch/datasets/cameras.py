@@ -32,6 +32,9 @@ CameraChoice = str | Path | PinholeCamera | None
 ImageSize = Callable[[], tuple[int, int]]
 """Function that returns width and height of the images of a sequence."""
 
+PublishedCamera = Callable[[], PinholeCamera | None]
+"""Function that returns the camera that a data set or a recording states; None if it states none."""
+
 _DEFAULT_SIZE = (PinholeCamera.width, PinholeCamera.height)
 
 
@@ -65,7 +68,7 @@ def load_camera(path_or_name: str | Path, image_size: ImageSize | None = None) -
 def choose_camera(
     camera: CameraChoice,
     folder: Path,
-    published: PinholeCamera | None = None,
+    published: PublishedCamera | None = None,
     *,
     depth_scale: float | None = None,
     image_size: ImageSize | None = None,
@@ -78,7 +81,8 @@ def choose_camera(
     Args:
         camera: Camera chosen by the user.
         folder: Folder of the sequence.
-        published: Camera of the dataset, if all its sequences have the same.
+        published: Function that gives the camera of the dataset or the recording, which can raise InputError; called
+            only if the camera or its depth scale is needed.
         depth_scale: Depth units per metre that the layout prescribes, for a camera that does not state them; None for
             those of the published camera, or of the TUM benchmark if the folder is named like one of its sequences.
         image_size: Function that gives the size of the images for a camera file that does not state it.
@@ -89,19 +93,24 @@ def choose_camera(
     Raises:
         InputError: If there is no camera, or the camera is invalid.
     """
-    preset = _tum_preset(folder)
     if camera is not None:
         chosen = load_given_camera(camera, image_size)
     else:
-        chosen = _camera_of_folder(folder, published or preset, image_size)
+        file = camera_file(folder)
+        chosen = load_camera(file, image_size) if file is not None else _published_camera(folder, published)
         check_distortion(chosen, folder)
     if chosen.depth_scale is not None:
         return chosen
-    is_tum = canonical_name(folder.resolve().name) is not None
-    known = published or (preset if is_tum else None)
-    if depth_scale is None and known is not None:
-        depth_scale = known.depth_scale
+    if depth_scale is None:
+        is_tum = canonical_name(folder.resolve().name) is not None
+        known = (published() if published is not None else None) or (_tum_preset(folder) if is_tum else None)
+        depth_scale = known.depth_scale if known is not None else None
     return replace(chosen, depth_scale=depth_scale)
+
+
+def camera_file(folder: Path) -> Path | None:
+    """Return the camera file in a folder, ``camera.yaml`` or ``K.txt``; None if there is none."""
+    return next((folder / name for name in ("camera.yaml", "K.txt") if (folder / name).is_file()), None)
 
 
 def load_given_camera(camera: str | Path | PinholeCamera, image_size: ImageSize | None = None) -> PinholeCamera:
@@ -126,12 +135,11 @@ def load_given_camera(camera: str | Path | PinholeCamera, image_size: ImageSize 
     return loaded
 
 
-def _camera_of_folder(folder: Path, published: PinholeCamera | None, image_size: ImageSize | None) -> PinholeCamera:
-    for name in ("camera.yaml", "K.txt"):
-        if (folder / name).is_file():
-            return load_camera(folder / name, image_size)
-    if published is not None:
-        return published
+def _published_camera(folder: Path, published: PublishedCamera | None) -> PinholeCamera:
+    """Return the camera of the data set or the recording, else the preset for the folder's name."""
+    camera = (published() if published is not None else None) or _tum_preset(folder)
+    if camera is not None:
+        return camera
     raise InputError(
         f"{folder}: has no camera parameters; add a camera.yaml (fx, fy, cx, cy, width, height, depth_scale) or pass"
         f" --camera with a file or one of {', '.join(PRESETS)}"

@@ -56,7 +56,7 @@ class ICLNUIMSequence(PairedImages):
             _original_pairs(folder) if self._is_original else _listed_pairs(folder),
             camera,
             lambda: camera_poses(read_trajectory(groundtruth_files[0])) if groundtruth_files else None,
-            published=CAMERA,
+            published=lambda: CAMERA,
         )
 
     def _read_depth(self, index: int) -> NDArray[np.generic]:

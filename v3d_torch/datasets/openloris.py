@@ -30,7 +30,8 @@ class OpenLORISSequence(PairedImages):
 
     Args:
         folder: Folder of the sequence.
-        camera: Camera chosen by the user; None for the camera in ``sensors.yaml``.
+        camera: Camera chosen by the user; None for the ``camera.yaml`` or ``K.txt`` in the folder, else the camera in
+            ``sensors.yaml``.
 
     Raises:
         InputError: If a file is missing or invalid.
@@ -38,14 +39,13 @@ class OpenLORISSequence(PairedImages):
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
         pairs = pair_lists(folder / "color.txt", folder / "aligned_depth.txt")
-        published = None if camera is not None else _read_camera(folder / "sensors.yaml")
         groundtruth = folder / "groundtruth.txt"
         super().__init__(
             folder,
             pairs,
             camera,
             lambda: _camera_poses(groundtruth, folder / "trans_matrix.yaml") if groundtruth.is_file() else None,
-            published=published,
+            published=lambda: _read_camera(folder / "sensors.yaml"),
             depth_scale=_DEPTH_SCALE,
         )
 

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice, PublishedCamera, choose_camera
 from v3d_torch.datasets.depth_files import read_depth_file
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.stored import ReadGroundTruth
-from v3d_torch.geometry.camera import PinholeCamera
 
 
 class PairedImages(ImageSequence):
@@ -25,7 +24,7 @@ class PairedImages(ImageSequence):
         pairs: Image files of the frames, in temporal order.
         camera: Camera chosen by the user; None for the camera of the folder or the layout (`choose_camera`).
         groundtruth: Function that reads the measured poses of the camera.
-        published: Camera of all sequences of the layout; None if they have different cameras.
+        published: Function that gives the camera that the layout states (`choose_camera`); None if it states none.
         depth_scale: Depth units per metre that the layout prescribes; None if it does not prescribe them.
         name: Name used in tables; None for the folder's name.
 
@@ -40,7 +39,7 @@ class PairedImages(ImageSequence):
         camera: CameraChoice,
         groundtruth: ReadGroundTruth | None = None,
         *,
-        published: PinholeCamera | None = None,
+        published: PublishedCamera | None = None,
         depth_scale: float | None = None,
         name: str | None = None,
     ) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.camera_fields import camera_from_fields, check_principal_point
-from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.cameras import CameraChoice, camera_file
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair
@@ -36,7 +36,8 @@ class ScanNetSequence(PairedImages):
 
     Args:
         folder: Folder of the sequence, or its parent if the sequence is in a subfolder ``frames``.
-        camera: Camera of the depth images, chosen by the user; None for ``intrinsic_depth.txt``.
+        camera: Camera of the depth images, chosen by the user; None for the ``camera.yaml`` or ``K.txt`` in
+            either folder, else ``intrinsic_depth.txt``.
 
     Raises:
         InputError: If a file is missing or invalid.
@@ -47,13 +48,12 @@ class ScanNetSequence(PairedImages):
         pairs = pair_by_number(frames, list_images(frames / "color"), list_images(frames / "depth"), _RATE)
         stamps = {round(pair.stamp * _RATE): pair.stamp for pair in pairs}
         pose_files = {frame_number(path): path for path in frames.glob("pose/*.txt")}
-        published = None if camera is not None else _depth_camera(frames, pairs[0])
         super().__init__(
             frames,
             pairs,
-            camera,
+            camera if camera is not None else camera_file(folder),
             lambda: read_poses({stamp: pose_files[number] for number, stamp in stamps.items() if number in pose_files}),
-            published=published,
+            published=lambda: _depth_camera(frames, pairs[0]),
             depth_scale=_DEPTH_SCALE,
             name=folder.resolve().name,
         )

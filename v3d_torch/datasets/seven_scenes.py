@@ -37,7 +37,7 @@ class SevenScenesSequence(PairedImages):
             pairs,
             camera,
             lambda: read_poses({stamp: path for stamp, path in pose_files.items() if path.is_file()}),
-            published=CAMERA,
+            published=lambda: CAMERA,
             name="/".join(folder.resolve().parts[-2:]),
         )
 

@@ -8,7 +8,7 @@ import torch
 from kornia_rs import io
 from torch import Tensor
 
-from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.cameras import CameraChoice, PublishedCamera
 from v3d_torch.datasets.gravity_file import GRAVITY_FILE, read_gravity_file
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
@@ -16,7 +16,6 @@ from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.sequence_names import folder_label
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.camera import PinholeCamera
 
 
 class TUMSequence(PairedImages):
@@ -29,7 +28,8 @@ class TUMSequence(PairedImages):
     Args:
         folder: Folder of the sequence.
         camera: A camera, the name of a preset or a camera file; None for the camera of the folder (`choose_camera`).
-        published: Camera of all sequences of a data set in this layout; None for the TUM RGB-D benchmark.
+        published: Function that gives the camera of all sequences of a data set in this layout; None for the TUM RGB-D
+            benchmark.
         name: Name used in tables; None to derive it from the folder's name.
 
     Raises:
@@ -41,7 +41,7 @@ class TUMSequence(PairedImages):
         folder: Path,
         camera: CameraChoice = None,
         *,
-        published: PinholeCamera | None = None,
+        published: PublishedCamera | None = None,
         name: str | None = None,
     ) -> None:
         if not folder.is_dir():

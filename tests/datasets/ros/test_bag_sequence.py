@@ -13,7 +13,7 @@ import torch
 from helpers.bags import DEPTH, INFO, KINDS, RGB, Kind, Message, MessageFactory
 from helpers.commands import call_here
 from helpers.demo_frames import copy_frames
-from helpers.tiny_images import HEIGHT, WIDTH, as_rgb, colour_of, depth_of
+from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, as_rgb, colour_of, depth_of
 
 from v3d_torch.datasets import SourceOptions, load_sequence
 from v3d_torch.datasets.ros import BagSequence
@@ -194,6 +194,12 @@ def test_camera_of_the_user_sets_the_depth_scale(tmp_path: Path) -> None:
     sequence = load_sequence(str(bag), camera=camera)
     assert sequence.camera is camera
     np.testing.assert_allclose(sequence[0].depth[0], depth_of(0) / 5000, rtol=1e-6)
+
+
+def test_camera_file_in_the_folder_of_a_bag_replaces_camera_info(tmp_path: Path) -> None:
+    bag = ROS2.write(tmp_path / "take", [message for message in valid_messages(ROS2) if message[0] != INFO])
+    (bag / "camera.yaml").write_text(CAMERA_YAML)
+    assert load_sequence(str(bag)).camera == PinholeCamera(30, 31, 15.5, 11.5, WIDTH, HEIGHT, depth_scale=1000)
 
 
 @pytest.mark.parametrize(

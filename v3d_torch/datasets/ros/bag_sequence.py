@@ -44,7 +44,8 @@ class BagSequence(ImageSequence):
 
     Args:
         path: A ``.bag``, ``.db3`` or ``.mcap`` file, or the folder of a ROS 2 bag.
-        camera: Camera chosen by the user; None for the CameraInfo of the colour images.
+        camera: Camera chosen by the user; None for the ``camera.yaml`` or ``K.txt`` in the folder of a ROS 2 bag, else
+            the CameraInfo of the colour images.
         rgb_topic: Topic of the colour images; None to choose it by name, see `choose_topics`.
         depth_topic: Topic of the depth images; None to choose it by name.
         info_topic: Topic of the camera info; None to choose it by name.
@@ -72,7 +73,7 @@ class BagSequence(ImageSequence):
         chosen = choose_camera(
             camera,
             path,
-            None if camera is not None else _read_camera(path, topics),
+            lambda: _read_camera(path, topics),
             depth_scale=_DEPTH_SCALE,
             image_size=lambda: _image_size(path, topics),
         )
