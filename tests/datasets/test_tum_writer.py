@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,18 @@ def test_depth_is_exact_and_out_of_range_is_zero(tmp_path: Path) -> None:
     assert torch.equal(frame.depth, torch.where(units < 65535, units / 1000, 0))
     far = load_sequence(str(tmp_path / "2.0"))[0].depth
     assert torch.equal(far == 0, units >= 35535)
+
+
+def test_depth_out_of_range_is_counted_in_one_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    image, depth = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.full((1, HEIGHT, WIDTH), 13.0)
+    far = depth.clone()
+    far[0, :2, 0] = 13.2
+    for name, images in (("near", [depth]), ("far", [depth, far, far])):
+        with TUMWriter(tmp_path / name, PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT)) as writer:
+            for index, metres in enumerate(images):
+                writer.add(RGBDFrame(index, 12.5 + index, image, metres))
+    (record,) = caplog.records
+    assert re.search(r"far: 4 depth values beyond 13\.11 m were saved as 0; a camera with a", record.getMessage())
 
 
 def test_gravity_of_the_first_frame_is_kept(tmp_path: Path) -> None:

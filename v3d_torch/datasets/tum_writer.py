@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,8 @@ from v3d_torch.geometry.depth_units import SATURATED_DEPTH
 from v3d_torch.io.files import check_empty_folder, write_png, write_text
 from v3d_torch.types import RGBDFrame, Trajectory
 
+_LOG = logging.getLogger(__name__)
+
 _DEPTH_SCALE = 5000.0
 """Depth scale of the TUM benchmark, units per metre."""
 
@@ -26,7 +29,8 @@ _GROUND_TRUTH, _COMMENT = "groundtruth.txt", "poses of the camera, written by v3
 class TUMWriter:
     """Writer of RGB-D frames to a folder in TUM layout, used as a context manager.
 
-    Images are written immediately. The lists of images are written at the end of the context, also after an exception.
+    Images are written immediately. The lists of images are written at the end of the context, also after an exception;
+    if depth was out of range, a warning is logged then.
 
     Args:
         folder: Folder of the sequence, new or empty.
@@ -43,6 +47,7 @@ class TUMWriter:
         self.folder = folder
         self._depth_scale = _DEPTH_SCALE if camera.depth_scale is None else camera.depth_scale
         self._written: list[tuple[str, str]] = []
+        self._out_of_range = 0
         # The depth of the frames is already corrected.
         written = replace(camera, depth_scale=self._depth_scale, inverse_depth_offset=0.0)
         write_text(folder / "camera.yaml", camera_text(written))
@@ -62,6 +67,11 @@ class TUMWriter:
         }
         for name, lines in lists.items():
             write_text(self.folder / name, "".join(f"{line}\n" for line in lines))
+        if self._out_of_range:
+            _LOG.warning(
+                "%s: %d depth values beyond %.4g m were saved as 0; a camera with a smaller depth_scale keeps them",
+                self.folder, self._out_of_range, (SATURATED_DEPTH - 1) / self._depth_scale,
+            )  # fmt: skip
 
     def __len__(self) -> int:
         """Number of frames written."""
@@ -70,13 +80,15 @@ class TUMWriter:
     def add(self, frame: RGBDFrame) -> None:
         """Write the images of a frame, and the gravity of the first frame to ``gravity.txt`` if it was measured.
 
-        Depth beyond the 16-bit range is written as 0, no measurement.
+        Depth is rounded to units of the depth scale; beyond the 16-bit range, it is written as 0, no measurement.
         """
         if frame.gravity is not None and not self._written:
             write_gravity_file(self.folder, frame.stamp, frame.gravity)
         stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         units = np.rint(frame.depth[0].numpy() * self._depth_scale)
-        units[units >= SATURATED_DEPTH] = 0
+        is_out_of_range = units >= SATURATED_DEPTH
+        units[is_out_of_range] = 0
+        self._out_of_range += int(is_out_of_range.sum())
         write_png(self.folder / "rgb" / f"{stamps[0]}.png", frame.image.permute(1, 2, 0).numpy())
         write_png(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))
         self._written.append(stamps)
