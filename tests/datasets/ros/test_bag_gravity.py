@@ -31,14 +31,16 @@ def write_bag(make: MessageFactory, path: Path, extra: list[Message], camera_fra
     return sequence
 
 
-def measurements(make: MessageFactory, acceleration: np.ndarray, frame: str = "optical") -> list[Message]:
+def measurements(
+    make: MessageFactory, acceleration: np.ndarray, frame: str = "optical", topic: str = "/imu"
+) -> list[Message]:
     """Half a second of noisy measurements before the first image, and others long before and after it."""
     rng = np.random.default_rng(0)
     still = [
-        ("/imu", 15 + n / 100, make.imu(9.5 + n / 100, acceleration + rng.normal(0, 0.1, 3), frame)) for n in range(55)
+        (topic, 15 + n / 100, make.imu(9.5 + n / 100, acceleration + rng.normal(0, 0.1, 3), frame)) for n in range(55)
     ]
     other = -acceleration
-    return [("/imu", 1.0, make.imu(5.0, other, frame)), *still, ("/imu", 19.0, make.imu(15.0, other, frame))]
+    return [(topic, 1.0, make.imu(5.0, other, frame)), *still, (topic, 19.0, make.imu(15.0, other, frame))]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -58,6 +60,30 @@ def test_first_frame_has_the_gravity_in_the_frame_of_the_camera(kind: Kind, tmp_
 def test_accelerometer_in_the_frame_of_the_camera_needs_no_transforms(tmp_path: Path) -> None:
     make = MessageFactory("mcap")
     gravity = write_bag(make, tmp_path, measurements(make, -9.81 * DOWN))[0].gravity
+    assert gravity is not None and float(gravity @ torch.from_numpy(DOWN)) > np.cos(np.radians(0.5))
+
+
+@pytest.mark.parametrize(
+    ("camera", "imu", "is_used"),
+    [
+        ("camera_color_optical_frame", "camera_imu_optical_frame", True),
+        ("front_color_optical_frame", "rear_imu_optical_frame", False),
+        ("camera_front_color_optical_frame", "camera_rear_imu_optical_frame", False),
+        ("front/color_optical_frame", "rear/imu_optical_frame", False),
+    ],
+)
+def test_only_optical_frames_of_one_camera_are_aligned(camera: str, imu: str, is_used: bool, tmp_path: Path) -> None:
+    make = MessageFactory("mcap")
+    gravity = write_bag(make, tmp_path, measurements(make, -9.81 * DOWN, imu), camera)[0].gravity
+    assert (gravity is not None) == is_used
+
+
+def test_accelerometer_of_the_same_camera_is_preferred(tmp_path: Path) -> None:
+    """Both could be used: the names of the frames do not tell the cameras apart."""
+    make = MessageFactory("mcap")
+    others = measurements(make, 9.81 * DOWN, "camera_imu_optical_frame", "/another/imu")
+    own = measurements(make, -9.81 * DOWN, "camera_imu_optical_frame", f"/{RGB.split('/')[1]}/imu")
+    gravity = write_bag(make, tmp_path, [*others, *own], "camera_color_optical_frame")[0].gravity
     assert gravity is not None and float(gravity @ torch.from_numpy(DOWN)) > np.cos(np.radians(0.5))
 
 

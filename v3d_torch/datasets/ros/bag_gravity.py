@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from v3d_torch.datasets.gravity import gravity_direction
+from v3d_torch.datasets.ros.bag_topics import shared_parts
 
 _LOG = logging.getLogger(__name__)
 
@@ -22,19 +24,28 @@ _BEFORE, _AFTER = 0.5, 0.1
 """Time before and after the first frame in which accelerations are averaged, seconds: longer than the vibration of a
 hand, but short enough that the camera turns little."""
 
+_OPTICAL_FRAME = re.compile(r"(.*?)[^_/]*_optical_frame")
+"""Name of an optical frame: the camera, and one word for the sensor, as in ``camera_color_optical_frame``."""
+
 ReadMessages = Callable[[str], Iterator[tuple[str, int, Any]]]
 """Function that yields topic, arrival time (nanoseconds) and message of a topic, in order of arrival."""
 
 
 def read_gravity(
-    path: object, types: Mapping[str, str], read: ReadMessages, colour_frame: str, first_stamp: float
+    path: object,
+    types: Mapping[str, str],
+    read: ReadMessages,
+    colour_topic: str,
+    colour_frame: str,
+    first_stamp: float,
 ) -> Tensor | None:
-    """Read the direction of gravity.
+    """Read the direction of gravity; of several accelerometers, that of the camera is preferred.
 
     Args:
         path: Path of the bag, for the log.
         types: Message type of each topic.
         read: Function that reads the messages of a topic.
+        colour_topic: Topic of the colour images; topics of one camera share the first parts of their names.
         colour_frame: Name of the frame of the colour camera, without slashes.
         first_stamp: Stamp of the first frame, seconds.
 
@@ -42,7 +53,8 @@ def read_gravity(
         Unit vector, frame of the colour camera, float64, shape :math:`(3,)`. None if no accelerometer measured around
         the first frame, or if its orientation relative to the camera is not known.
     """
-    for topic in (topic for topic, kind in types.items() if kind == IMU):
+    topics = [topic for topic, kind in types.items() if kind == IMU]
+    for topic in sorted(topics, key=lambda topic: -shared_parts(topic, colour_topic)):
         frame, accelerations = _read_accelerations(read(topic), first_stamp)
         if not np.any(accelerations):  # such as on the topic of a gyroscope
             continue
@@ -81,7 +93,9 @@ def _find_rotation(target: str, source: str, messages: list[Any]) -> NDArray[np.
     """
     if not target or not source:
         return None
-    if target == source or (target.endswith("optical_frame") and source.endswith("optical_frame") and not messages):
+    optical = [_OPTICAL_FRAME.fullmatch(name) for name in (target, source)]
+    is_same_camera = optical[0] is not None and optical[1] is not None and optical[0][1] == optical[1][1]
+    if target == source or (is_same_camera and not messages):
         return np.eye(3)
     neighbours: dict[str, list[tuple[str, Rotation]]] = {}
     for transform in (transform for message in messages for transform in message.transforms):

@@ -105,7 +105,8 @@ class BagSequence(ImageSequence):
             Cursor(partial(_read_messages, path, topic)) for topic in (topics.rgb, topics.depth)
         )
         self._read(0)  # raise errors that concern every frame here, and not later
-        self.gravity = read_gravity(path, types, partial(_read_messages, path), colour_frame, float(self.stamps[0]))
+        read, start = partial(_read_messages, path), float(self.stamps[0])
+        self.gravity = read_gravity(path, types, read, topics.rgb, colour_frame, start)
 
     @property
     def notes(self) -> list[str]:

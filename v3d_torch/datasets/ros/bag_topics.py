@@ -44,7 +44,7 @@ class BagTopics:
     @property
     def is_registered(self) -> bool:
         """True if the topic names imply that depth is registered to colour, pixel by pixel, of the same camera."""
-        return bool(_REGISTERED.search(self.depth)) and _shared_parts(self.depth, self.rgb) > 0
+        return bool(_REGISTERED.search(self.depth)) and shared_parts(self.depth, self.rgb) > 0
 
 
 def choose_topics(
@@ -82,7 +82,7 @@ def choose_topics(
         rgb = _choose_best(bag, "colour", "rgb", rgb_ranks, images)
     if depth is None:
         depth_ranks = {
-            topic: (-_shared_parts(topic, rgb), not _REGISTERED.search(topic), _compression_rank(topic, images))
+            topic: (-shared_parts(topic, rgb), not _REGISTERED.search(topic), _compression_rank(topic, images))
             for topic in candidates
             if _DEPTH.search(topic) and topic != rgb
         }
@@ -112,7 +112,7 @@ def _compression_rank(topic: str, images: Mapping[str, str]) -> int:
     return 0 if images[topic] == IMAGE else 1 if topic.endswith("compressedDepth") else 2
 
 
-def _shared_parts(topic: str, other: str) -> int:
+def shared_parts(topic: str, other: str) -> int:
     """Number of leading name parts that two topics share; topics of one camera share most."""
     pairs = zip(topic.strip("/").split("/"), other.strip("/").split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
