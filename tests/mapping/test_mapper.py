@@ -26,11 +26,11 @@ class FrameFeeder:
         overrides = [f"mapping.{key}={value}" for key, value in settings.items()]
         config = load_config(overrides=[*overrides, "mapping.bundle_keyframes=0"])
         self.mapper = Mapper(config, CAMERA, SparseMap.empty(config, CAMERA))
-        self.index, self.counts, self.stamp = -1, True, -1 / 30
+        self.index, self.step, self.stamp = -1, 1, -1 / 30
 
     def __call__(self, matched: int, status: TrackingStatus = TRACKED, feature_count: int = 400) -> bool:
         """Process the next frame; returns whether it became a keyframe."""
-        self.index += self.counts
+        self.index += self.step
         self.stamp += 1 / 30
         image, depth = torch.zeros(3, 480, 640, dtype=torch.uint8), torch.zeros(1, 480, 640)
         landmarks = torch.full((feature_count,), -1)
@@ -71,8 +71,10 @@ def test_keyframe_is_inserted_after_the_maximum_interval() -> None:
     assert [index for index, is_keyframe in enumerate(inserted) if is_keyframe] == [0, 5, 10, 15]
     feed.index = 0  # the camera was started again
     assert [feed(300) for _ in range(10)] == 2 * [False, False, False, False, True]
-    feed.counts = False
+    feed.step = 0  # the frames have no index
     assert [feed(300) for _ in range(10)] == 2 * [False, False, False, False, True]
+    feed.step = 3  # two of three frames are dropped
+    assert [feed(300) for _ in range(6)] == 3 * [False, True]
 
 
 def test_map_continues_by_odometry_after_the_delay_and_stays_connected() -> None:

@@ -36,7 +36,7 @@ class Mapper:
         self.map = sparse_map
         self._most_tracked = 0  # maximum number of landmarks that a frame matched since the last keyframe
         self._untracked_since: float | None = None  # timestamp, seconds
-        self._frames_since_keyframe = 0
+        self._frames_since_keyframe, self._last_index = 0, -1
 
     def __call__(
         self, frame: RGBDFrame, features: Features, pose: FramePose, reference: Keyframe | None
@@ -52,7 +52,9 @@ class Mapper:
         Returns:
             The new keyframe, or None.
         """
-        self._frames_since_keyframe += 1
+        # Dropped frames count; the index of a camera that is started again does not increase.
+        self._frames_since_keyframe += max(frame.index - self._last_index, 1)
+        self._last_index = frame.index
         if not self._needs_keyframe(frame, features, pose):
             return None
         keyframe = self.map.insert_keyframe(frame.index, frame.stamp, pose.T_cw, features, pose.landmarks)
@@ -68,13 +70,14 @@ class Mapper:
             "most_tracked": self._most_tracked,
             "untracked_since": self._untracked_since,
             "frames_since_keyframe": self._frames_since_keyframe,
+            "last_index": self._last_index,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         self._most_tracked = state["most_tracked"]
         self._untracked_since = state["untracked_since"]
-        self._frames_since_keyframe = state["frames_since_keyframe"]
+        self._frames_since_keyframe, self._last_index = state["frames_since_keyframe"], state["last_index"]
 
     def _needs_keyframe(self, frame: RGBDFrame, features: Features, pose: FramePose) -> bool:
         """Decide whether the map needs a keyframe, and update the counters of this decision."""
