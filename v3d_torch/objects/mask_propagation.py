@@ -18,7 +18,7 @@ from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
-from v3d_torch.objects.track import Track
+from v3d_torch.objects.track import Track, predict_clouds
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
@@ -43,9 +43,7 @@ def propagate_instances(
         Instances with the classes of the tracks, score 0 and empty boxes.
     """
     detected = [track for track in tracks if not track.missed and track.label != UNLABELLED]
-    R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
-    clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in detected]
-    projected = silhouettes(clouds, camera, config.voxel_size)
+    projected = silhouettes(predict_clouds(detected, view.stamp, view.T_cw), camera, config.voxel_size)
     masks = {
         track: mask
         for track, each in zip(detected, projected, strict=True)

@@ -26,7 +26,7 @@ from v3d_torch.objects.mask_ops import dilate, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
-from v3d_torch.objects.track import Track
+from v3d_torch.objects.track import Track, predict_clouds
 
 _TOLERANCE_GROWTH = 0.01
 """Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
@@ -59,8 +59,7 @@ class MaskRefiner:
         self._newly_occupied = newly_occupied
         self._stride = newly_occupied.stride
         located = [track for track in tracks if track.newest.has_centroid]
-        R, t = view.T_cw[:3, :3], view.T_cw[:3, 3]
-        clouds = [track.predict_cloud(view.stamp) @ R.T + t for track in located]
+        clouds = predict_clouds(located, view.stamp, view.T_cw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
         projected = silhouettes(clouds, camera, spacing)
         self._silhouettes = dict(zip(located, zip(projected, median_depths, strict=True), strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import InitVar, dataclass, field
 from functools import cached_property
 
@@ -342,3 +343,17 @@ class Track:
         if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
             oldest = state.stamp - _STATE_HISTORY
             self.history = [each for each in self.history if each.stamp >= oldest] + [state]
+
+
+def predict_clouds(tracks: Iterable[Track], stamp: float, T_cw: Tensor) -> list[Tensor]:
+    """Predict the clouds of tracks in the frame of a camera, see `Track.predict_cloud`.
+
+    Args:
+        tracks: Tracks.
+        stamp: Timestamp, seconds.
+        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+
+    Returns:
+        Point clouds, camera frame, metres, float64, each of shape :math:`(P, 3)`.
+    """
+    return [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in tracks]

@@ -23,7 +23,7 @@ from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
-from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.objects.track import Detection3D, Track, predict_clouds
 from v3d_torch.types import Instances
 
 _MIN_VISIBLE_FRACTION = 0.5
@@ -137,8 +137,7 @@ def predict_tracks(
         config: Spacing and maximum depth of the points of the clouds.
         stride: Step between the coarse pixels, pixels.
     """
-    clouds = [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in tracks]
-    projected = silhouettes(clouds, camera, config.voxel_size)
+    projected = silhouettes(predict_clouds(tracks, stamp, T_cw), camera, config.voxel_size)
     coarse_depth = depth[:, ::stride, ::stride].contiguous()
     masks = [
         predict_mask(track, each, coarse_depth, config.max_depth, step=stride)
