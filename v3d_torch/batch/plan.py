@@ -75,12 +75,13 @@ def plan_jobs(
         folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
         skip_broken: True if runs skip broken frames.
     """
+    digests = {name: sequence_digest(sequence) for name, (_, sequence) in sequences.items()}
     return [
         Job(
             sequence=name,
             source=str(path.absolute()) if (path := expand_user(source)).exists() else source,
             frames=len(sequence),
-            digest=digest,
+            digest=digests[name],
             data_root=data_root_of(source, data_root),  # other machines may lack the variable
             config_name=label,
             config=config.model_copy(update={"seed": seed}),
@@ -88,7 +89,6 @@ def plan_jobs(
             skip_broken=skip_broken,
         )
         for name, (source, sequence) in sequences.items()
-        for digest in [sequence_digest(sequence)]
         for label, config in configs.items()
         for seed in range(seeds)
     ]

@@ -26,7 +26,7 @@ def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, 
 
     Returns:
         Ratio and its standard deviation, by the jackknife over blocks of time; None if the trajectories have too few
-        common poses, if the positions of one do not span a plane, or if the estimated ones do not follow the others.
+        common poses, if the positions of one do not span a plane, or if the positions are not correlated.
     """
     matches = associate_trajectories(groundtruth, estimate)
     if len(matches) < _MIN_PAIRS:

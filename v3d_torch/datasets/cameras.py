@@ -93,17 +93,18 @@ def choose_camera(
     Raises:
         InputError: If there is no camera, or the camera is invalid.
     """
+    stated: PublishedCamera = published or (lambda: None)
     if camera is not None:
         chosen = load_given_camera(camera, image_size)
     else:
         file = camera_file(folder)
-        chosen = load_camera(file, image_size) if file is not None else _published_camera(folder, published)
+        chosen = load_camera(file, image_size) if file is not None else _published_camera(folder, stated)
         check_distortion(chosen, folder)
     if chosen.depth_scale is not None:
         return chosen
     if depth_scale is None:
         is_tum = canonical_name(folder.resolve().name) is not None
-        known = (published() if published is not None else None) or (_tum_preset(folder) if is_tum else None)
+        known = stated() or (_tum_preset(folder) if is_tum else None)
         depth_scale = known.depth_scale if known is not None else None
     return replace(chosen, depth_scale=depth_scale)
 
@@ -135,9 +136,9 @@ def load_given_camera(camera: str | Path | PinholeCamera, image_size: ImageSize 
     return loaded
 
 
-def _published_camera(folder: Path, published: PublishedCamera | None) -> PinholeCamera:
+def _published_camera(folder: Path, published: PublishedCamera) -> PinholeCamera:
     """Return the camera of the data set or the recording, else the preset for the folder's name."""
-    camera = (published() if published is not None else None) or _tum_preset(folder)
+    camera = published() or _tum_preset(folder)
     if camera is not None:
         return camera
     raise InputError(

@@ -61,9 +61,8 @@ class ORB:
         Returns:
             Features with the depth of their nearest pixel.
         """
-        grey = np.asarray(kornia_rs.imgproc.gray_from_rgb(brighten(image).permute(1, 2, 0).contiguous().numpy()))[
-            ..., 0
-        ]
+        pixels = brighten(image).permute(1, 2, 0).contiguous().numpy()
+        grey = np.asarray(kornia_rs.imgproc.gray_from_rgb(pixels))[..., 0]
         canvas = self._pyramid.build(grey)
         corners, level = self._detect(canvas)
         smoothed = kornia_rs.imgproc.gaussian_blur(canvas[..., None], _SMOOTHING_SIZE, _SMOOTHING_SIGMA)[..., 0]

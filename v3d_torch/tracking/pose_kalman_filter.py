@@ -117,8 +117,8 @@ def predict_covariance(covariance: Tensor, twist: Tensor, elapsed: float) -> Ten
     return F @ covariance @ F.T + torch.kron(noise, _TWIST_COVARIANCE)
 
 
-def interpolation_covariance(before: float, after: float) -> Tensor:
-    r"""Covariance of the errors of pose and twist that are interpolated between two known states.
+def interpolation_covariances(before: float, after: float) -> tuple[Tensor, Tensor]:
+    r"""Covariances of the errors of pose and twist that are interpolated between two known states.
 
     Unknown acceleration moves the camera off the interpolated path. White noise of density q displaces it by the
     variance :math:`q s^2 (T - s)^2 / 3 T` at the time s of an interval T, and its velocity by :math:`q s (T - s) / T`
@@ -129,8 +129,7 @@ def interpolation_covariance(before: float, after: float) -> Tensor:
         after: Time until the state after, seconds.
 
     Returns:
-        Covariance, float64, shape :math:`(12, 12)`.
+        Covariance of the pose and of the twist, float64, shape :math:`(6, 6)` each.
     """
     bridge = before * after / (before + after)
-    noise = torch.tensor([before * after * bridge / 3, bridge], dtype=torch.float64).diag()
-    return torch.kron(noise, _TWIST_COVARIANCE)
+    return before * after * bridge / 3 * _TWIST_COVARIANCE, bridge * _TWIST_COVARIANCE

@@ -13,7 +13,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.camera_state import CameraState
-from v3d_torch.tracking.pose_kalman_filter import interpolation_covariance
+from v3d_torch.tracking.pose_kalman_filter import interpolation_covariances
 
 _DURATION = 10.0
 """Time for which states are stored, seconds, the same as in the transform buffer of ROS."""
@@ -97,21 +97,19 @@ def _interpolate(a: CameraState, b: CameraState, stamp: float) -> CameraState:
     fraction = (stamp - a.stamp) / (b.stamp - a.stamp)
     xi = se3_log(invert(a.T_wc) @ b.T_wc)
     Ad_a, Ad_b = adjoint(se3_exp(-fraction * xi)), adjoint(se3_exp((1 - fraction) * xi))
-    unknown_motion = interpolation_covariance(stamp - a.stamp, b.stamp - stamp)
-    blended = {
-        name: (1 - fraction) * Ad_a @ getattr(a, name) @ Ad_a.T + fraction * Ad_b @ getattr(b, name) @ Ad_b.T + added
-        for name, added in (
-            ("covariance", unknown_motion[:6, :6]),
-            ("twist_covariance", unknown_motion[6:, 6:]),
-            ("cross_covariance", unknown_motion[:6, 6:]),
-        )
-    }
+
+    def blend(of_a: Tensor, of_b: Tensor) -> Tensor:
+        return (1 - fraction) * Ad_a @ of_a @ Ad_a.T + fraction * Ad_b @ of_b @ Ad_b.T
+
+    of_pose, of_twist = interpolation_covariances(stamp - a.stamp, b.stamp - stamp)
     return CameraState(
         stamp=stamp,
         T_wc=orthonormalise(a.T_wc @ se3_exp(fraction * xi)),
         status=a.status if fraction < 0.5 else b.status,
         twist=(1 - fraction) * a.twist + fraction * b.twist,
-        **blended,
+        covariance=blend(a.covariance, b.covariance) + of_pose,
+        twist_covariance=blend(a.twist_covariance, b.twist_covariance) + of_twist,
+        cross_covariance=blend(a.cross_covariance, b.cross_covariance),
     )
 
 
