@@ -13,10 +13,12 @@ from typing import Any
 import pytest
 import torch
 from helpers.wall_run import CAMERA, FRAMES, Wall, square
+from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.live import LiveResult, LiveSLAM
+from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
@@ -82,6 +84,24 @@ def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -
     assert indices[0] == 0 and indices[-1] == FRAMES - 1 and len(indices) <= 4
     assert [result.dropped for result in results[1:]] == [b - a - 1 for a, b in itertools.pairwise(indices)]
     assert live.dropped == FRAMES - len(indices) == sum(result.dropped for result in results)
+
+
+def test_stages_are_called_before_the_camera_starts() -> None:
+    """The first call of colour histograms builds the tables of the colour space: it needs an object to do so."""
+    events: list[object] = []
+
+    def describe(image: Tensor, masks: Tensor) -> Tensor:
+        events.append(len(masks))
+        return colour_histograms(image, masks)
+
+    def source() -> Iterator[RGBDFrame]:
+        events.append("camera starts")
+        yield Wall()[0]
+
+    slam = V3DSLAM(CAMERA, square)
+    slam.describe_appearance = describe
+    assert len(list(LiveSLAM(source(), slam))) == 1
+    assert events[:2] == [1, "camera starts"]
 
 
 def test_first_frame_is_tracked_although_later_ones_wait_at_the_start() -> None:

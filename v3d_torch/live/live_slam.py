@@ -12,6 +12,7 @@ from v3d_torch.errors import ConfigError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.frame_capture import FrameCapture
 from v3d_torch.live.live_preprocessor import LivePreprocessor
+from v3d_torch.objects.assignment import match_instances
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
 from v3d_torch.runtime.process import trim_memory_at_intervals
 from v3d_torch.slam import V3DSLAM
@@ -126,11 +127,13 @@ class LiveSLAM:
 
 
 def _warm_up(slam: V3DSLAM) -> None:
-    """Call the stages without state on an empty image.
+    """Call the stages without state once, on an empty image with one object.
 
-    Libraries build tables at their first call, for a third of a second, in which ten frames would be dropped.
+    Libraries build tables and load modules at their first call, for a third of a second, in which ten frames would be
+    dropped.
     """
     size = slam.camera.height, slam.camera.width
     frame = RGBDFrame(0, 0.0, torch.zeros(3, *size, dtype=torch.uint8), torch.ones(1, *size))
     slam.extract_features(frame)
-    slam.describe_appearance(frame.image, torch.zeros(0, *size, dtype=torch.bool))
+    slam.describe_appearance(frame.image, torch.ones(1, *size, dtype=torch.bool))
+    match_instances(torch.ones(1, 1, 1))

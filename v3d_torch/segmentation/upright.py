@@ -5,6 +5,9 @@ direction is estimated without a gravity sensor, by the network itself: of the f
 upright one gives the detections with the highest scores. A search segments all four turns, and each turn votes for a
 direction in the world frame. As the camera turns, correct votes add up and wrong votes cancel out. A few searches
 suffice, because the camera poses relate the up direction to each new frame.
+
+The first search segments all turns of one image. A later search takes three images, and segments each of them upright
+and in one other turn, so that a live camera does not wait for four images at once.
 """
 
 from __future__ import annotations
@@ -33,8 +36,7 @@ moving camera has a different view at each search."""
 
 _SEARCH_CALLS = 128
 """Number of calls during which searches are this frequent, about 4 s at 30 Hz. It bounds the cost in scenes without
-detections, because a search takes four times as long as a call without search."""
-
+detections, because a search segments three images more."""
 
 _GRAVITY_WEIGHT = 2 * _CONFIDENT_WEIGHT
 """Weight of a measured gravity, in detections of score 1: so large that no search is needed."""
@@ -78,16 +80,18 @@ class UprightSegmenter:
             return self(frame)
         if frame.gravity is not None:
             self._up = _GRAVITY_WEIGHT * T_cw[:3, :3].T @ -frame.gravity
-            self._calls = max(self._calls, _SEARCH_CALLS + 1)
-        is_search = frame.gravity is None and self._is_search_due()
+            self._calls = max(self._calls, _SEARCH_CALLS + 4)  # after the last of the first searches
+        turns = self._upright_turns(T_cw)
+        others = [(turns + other) % 4 for other in self._other_turns()] if frame.gravity is None else []
         self._calls += 1
-        if not is_search:
-            return self._segment_rotated(frame, self._upright_turns(T_cw))
-        candidates = [self._segment_rotated(frame, turns) for turns in range(4)]
-        for turns, instances in enumerate(candidates):
+        candidates = {each: self._segment_rotated(frame, each) for each in (turns, *others)}
+        for each in candidates if others else ():
+            # In a search of three calls, the upright turn votes as much in all as each other turn.
+            weight = len(others) / 3 if each == turns else 1.0
             # Squared scores, because other orientations give as many detections, but with lower scores.
-            self._up = self._up + float(instances.scores.square().sum()) * T_cw[:3, :3].T @ _up_in_camera(turns)
-        return candidates[self._upright_turns(T_cw)]
+            votes = weight * float(candidates[each].scores.square().sum())
+            self._up = self._up + votes * T_cw[:3, :3].T @ _up_in_camera(each)
+        return candidates.get(self._upright_turns(T_cw), candidates[turns])
 
     def state_dict(self) -> dict[str, Any]:
         """Return the number of calls and the sum of votes for the up direction, see `Stateful`."""
@@ -97,11 +101,18 @@ class UprightSegmenter:
         """Restore a state of `state_dict`."""
         self._calls, self._up = state["calls"], state["up"].clone()
 
-    def _is_search_due(self) -> bool:
-        """Check whether to segment all turns: often until up is settled, then rarely, because poses are corrected."""
-        is_unsettled = self._calls < _SEARCH_CALLS and float(self._up.norm()) < _CONFIDENT_WEIGHT
-        is_zero_or_power_of_two = self._calls.bit_count() <= 1
-        return (is_unsettled and self._calls % _SEARCH_INTERVAL == 0) or is_zero_or_power_of_two
+    def _other_turns(self) -> list[int]:
+        """Turns to segment beside the upright one, counted from it: all in the first call, later one or none.
+
+        Searches are frequent until the up direction is settled, then rare, because poses are corrected.
+        """
+        if self._calls == 0:
+            return [1, 2, 3]
+        offset = self._calls % 4
+        start = self._calls - offset  # of the search: a call for the upright image alone, then one for each other turn
+        is_settled = start >= _SEARCH_CALLS or float(self._up.norm()) >= _CONFIDENT_WEIGHT
+        is_due = start.bit_count() <= 1 or (not is_settled and start % _SEARCH_INTERVAL == 0)
+        return [offset] if is_due and offset > 0 else []
 
     def _upright_turns(self, T_cw: Tensor) -> int:
         """Number of counterclockwise quarter turns that bring an image upright."""
