@@ -164,6 +164,16 @@ def test_mesh_is_closed_except_at_its_boundary() -> None:
     assert len(mesh.faces.unique()) == len(mesh.vertices)
 
 
+def test_views_that_disagree_leave_no_layer_behind_the_surface() -> None:
+    """A wall that two views measure 12 cm apart: between its two surfaces was one that faced away from both views."""
+    mesh = fuse_mesh(flat(2.0, (EYE, 2.12)), CONFIG)
+    torch.testing.assert_close(mesh.vertices[:, 2].unique(), torch.tensor([2.06, 2.12]), atol=1e-3, rtol=0)
+    a, b, c = mesh.vertices[mesh.faces].unbind(dim=1)
+    assert (torch.linalg.cross(b - a, c - a)[:, 2] < 0).all()
+    assert (mesh.normals[:, 2] < 0).all() and (mesh.colours == 128).all()
+    assert len(mesh.faces.unique()) == len(mesh.vertices)
+
+
 def test_mesh_is_equal_for_any_tile_size(monkeypatch: pytest.MonkeyPatch) -> None:
     views = views_of(looking_around(3), CRATE)
     whole = fuse_mesh(views, CONFIG)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from v3d_torch.config import DenseMapConfig
-from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.reconstruction.tsdf import BLOCK, integrate, surface_blocks
 
 _TILE = 16
@@ -60,8 +60,10 @@ def fuse_mesh(views: StaticViews, config: DenseMapConfig) -> Mesh:
     faces = merged[torch.cat(tile_faces)]
     faces = faces[(faces != faces.roll(1, dims=1)).all(dim=1)]  # drop triangles without area
     vertices = vertices * config.mesh.voxel_size
+    used, faces = _drop_hidden(vertices, faces, views, config).unique(return_inverse=True)
+    vertices = vertices[used]
     normals = _vertex_normals(vertices, faces)
-    colours = _vertex_colours(vertices, views, config)
+    colours = _vertex_colours(vertices, normals, views, config)
     return Mesh(vertices.to(torch.float32), faces, normals.to(torch.float32), colours)
 
 
@@ -98,31 +100,60 @@ def _assemble(values: Tensor, positions: Tensor) -> Tensor:
     return box.permute(0, 3, 1, 4, 2, 5).reshape((BLOCK * sides).tolist())[:x, :y, :z].contiguous()
 
 
+def _drop_hidden(vertices: Tensor, faces: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
+    """Drop the triangles that no view observes from the front, (F, 3) to (f, 3).
+
+    They form a layer behind the surface: where views disagree by more than the truncation distance, as at depth edges,
+    voxels behind the surface of one view are free space of another.
+    """
+    centres, normals = vertices[faces].mean(dim=1), _area_normals(vertices, faces)
+    hidden = torch.ones(len(faces), dtype=torch.bool)
+    for view in views:
+        rows = torch.nonzero(hidden)[:, 0]
+        hidden[rows] = _observe(centres[rows], normals[rows], view, views, config)[0] == 0
+    return faces[~hidden]
+
+
+def _area_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Normals of triangles, as long as twice their area, shape (F, 3)."""
+    a, b, c = vertices[faces].unbind(dim=1)
+    return torch.linalg.cross(b - a, c - a)
+
+
 def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     """Mean normal of the triangles at each vertex, weighted by area, shape (V, 3)."""
-    a, b, c = vertices[faces].unbind(dim=1)
-    area_normals = torch.linalg.cross(b - a, c - a)  # length: twice the area
-    sums = torch.zeros_like(vertices)
+    area_normals, sums = _area_normals(vertices, faces), torch.zeros_like(vertices)
     for corner in faces.unbind(dim=1):
         sums.index_add_(0, corner, area_normals)
     return normalize(sums, dim=1)
 
 
-def _vertex_colours(vertices: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
-    """Mean colour of each vertex in the views that observe it, weighted by inverse squared depth; uint8, (V, 3).
+def _vertex_colours(vertices: Tensor, normals: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
+    """Mean colour of each vertex in the views that observe it from the front, uint8, shape (V, 3).
 
     Colours are fused per vertex and not per voxel, because there are far fewer vertices.
     """
     sums, weights = vertices.new_zeros(len(vertices), 3), vertices.new_zeros(len(vertices), 1)
     for view in views:
-        in_camera = vertices @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
-        pixels, inside = views.camera.project_to_image(in_camera, config.mesh.voxel_size)
-        u, v = pixels.round().to(torch.int64).unbind(dim=1)
-        u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
-        z = in_camera[:, 2]
-        depth = view.depth[v, u]
-        observed = inside & (depth > 0) & ((depth - z).abs() < config.mesh.truncation)
-        weight = torch.where(observed, 1 / z.square(), 0.0)[:, None]
-        sums += weight * view.colour[:, v, u].T
-        weights += weight
+        weight, u, v = _observe(vertices, normals, view, views, config)
+        sums += weight[:, None] * view.colour[:, v, u].T
+        weights += weight[:, None]
     return torch.where(weights > 0, sums / weights, 0.0).round().to(torch.uint8)
+
+
+def _observe(
+    points: Tensor, normals: Tensor, view: StaticView, views: StaticViews, config: DenseMapConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of points of the surface in a view, and their pixels (u, v), shape (N,) each.
+
+    The weight is the inverse squared depth, and 0 where the view observes another surface, or this one from behind.
+    """
+    in_camera = points @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
+    pixels, inside = views.camera.project_to_image(in_camera, config.mesh.voxel_size)
+    u, v = pixels.round().to(torch.int64).unbind(dim=1)
+    u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
+    z = in_camera[:, 2]
+    depth = view.depth[v, u]
+    is_front = ((view.T_wc[:3, 3] - points) * normals).sum(dim=1) > 0
+    observed = inside & (depth > 0) & ((depth - z).abs() < config.mesh.truncation) & is_front
+    return torch.where(observed, 1 / z.square(), 0.0), u, v
