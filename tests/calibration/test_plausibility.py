@@ -14,6 +14,7 @@ from torch import Tensor
 from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.types import Trajectory
@@ -43,7 +44,7 @@ def step_views(factor: float) -> tuple[StaticViews, Trajectory]:
     stepped = StaticViews(CAMERA, 2)
     for view in views:
         inverse = 0.0029 * (1 / (0.0029 * slanted_depth())).round()
-        units = (factor / inverse / StaticViews.UNIT).round().clamp(0, 65535).to(torch.uint16)
+        units = (factor / inverse / STORED_UNIT).round().clamp(0, 65535).to(torch.uint16)
         stepped.append(replace(view, depth_units=units))
     return stepped, trajectory
 

@@ -1,4 +1,4 @@
-"""The sparse map: created landmarks, local map, edits, readout, state; covisibility against plain sets."""
+"""The sparse map: created landmarks, local map, edits, readout, state; covisibility and ids against plain sets."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import torch
 from helpers import rolling_camera
 from helpers.rolling_camera import KINECT, VELOCITY, observe_rolling, points_in_view
 from helpers.sparse_maps import CAMERA, EYE, features, make_map
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.mapping.map_observations import unique_ids
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, compensate_features
 
@@ -306,3 +309,10 @@ def test_map_with_the_state_of_another_map_continues_like_that_map(
         sparse_map.set_readout(Readout(0.03, 1e4))
     assert restored.keyframes is not original.keyframes and len(restored.keyframes) == 13 and len(restored.loops) == 1
     assert_equal_tables(original, restored)
+
+
+@given(st.lists(st.integers(0, 30), max_size=40))
+def test_unique_ids_equal_torch_unique(numbers: list[int]) -> None:
+    ids = torch.tensor(numbers, dtype=torch.int64)
+    for ours, expected in zip(unique_ids(ids, 31), ids.unique(return_inverse=True), strict=True):
+        assert torch.equal(ours, expected)

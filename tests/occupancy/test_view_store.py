@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
-from v3d_torch.occupancy.range_view import UNIT, RangeView
+from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.view_store import LEVER, ViewStore, displacement
 
 ALL = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
@@ -40,8 +41,8 @@ def test_samples_have_the_depth_and_ray_of_their_pixels() -> None:
         view = RangeView.sample(number, depth, ALL, 8)
         assert view.depth.shape == view.static.shape == (30, 40) and view.static.all()
         picked = depth[view.row :: 8, view.column :: 8]
-        expected = torch.where(picked.isfinite(), picked.clamp(max=(2**16 - 1) * UNIT), 0)
-        torch.testing.assert_close(view.depth, expected, rtol=0, atol=UNIT / 2 + 1e-6)
+        expected = torch.where(picked.isfinite(), picked.clamp(max=(2**16 - 1) * STORED_UNIT), 0)
+        torch.testing.assert_close(view.depth, expected, rtol=0, atol=STORED_UNIT / 2 + 1e-6)
         assert torch.equal(view.rays(CAMERA, 8), CAMERA.rays[view.row :: 8, view.column :: 8])
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.reconstruction import point_map as point_map_module
@@ -45,7 +46,7 @@ def test_points_equal_plain_voxel_means() -> None:
     views = StaticViews(CAMERA, 4)
     voxels: dict[tuple[int, ...], list[np.ndarray]] = {}
     for T_wc in looking_around(2) @ se3_exp(torch.tensor([0.0, 0, 0, 0, 0.2, 0], dtype=torch.float64)):
-        depth = (render(T_wc) / views.UNIT).round() * views.UNIT
+        depth = (render(T_wc) / STORED_UNIT).round() * STORED_UNIT
         depth[0, :20] = 0.0
         image = torch.randint(0, 256, (3, 240, 320), generator=generator, dtype=torch.uint8)
         static = torch.rand(60, 80, generator=generator).repeat_interleave(4, 0).repeat_interleave(4, 1) > 0.1

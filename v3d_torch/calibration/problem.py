@@ -17,13 +17,13 @@ import torch
 from torch import Tensor
 
 from v3d_torch.calibration.parameters import DERIVATIVE_STEPS, LIMITS, get_values, with_values
+from v3d_torch.calibration.reduced_cost import differentiate_minimum_cost
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.bundle_problem import prepare_bundle
 from v3d_torch.mapping.map_observations import MapObservations, select_observations
 from v3d_torch.mapping.map_tables import MapTables
-from v3d_torch.mapping.reduced_cost import differentiate_minimum_cost
 from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt
 from v3d_torch.optim.reprojection import reprojection_residuals
 

@@ -11,6 +11,10 @@ from torch import Tensor
 
 from v3d_torch.errors import InputError
 
+STORED_UNIT = 0.0002
+"""Unit of depth that the system stores in 16 bits, metres: the unit of TUM's depth images, which divides the
+millimetre. The maximum is 13 m, beyond the range of RGB-D cameras."""
+
 SATURATED_DEPTH = np.iinfo(np.uint16).max
 """Largest 16-bit depth value. No camera measures this value, and some datasets write it for missing depth."""
 

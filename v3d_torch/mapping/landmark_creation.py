@@ -9,7 +9,7 @@ from v3d_torch.config import FeaturesConfig
 from v3d_torch.features.features import Features, select_evenly
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
-from v3d_torch.mapping.tensor_table import TensorTable
+from v3d_torch.runtime.tensor_table import TensorTable
 
 
 def select_new_landmarks(features: Features, landmarks: Tensor, max_landmarks: int, cell: int) -> Tensor:

@@ -13,7 +13,7 @@ from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticView, StaticViews
-from v3d_torch.mapping.tensor_table import TensorTable
+from v3d_torch.runtime.tensor_table import TensorTable
 
 Columns = Mapping[str, Tensor]
 """Columns by ``group/name``. The columns of one group have the same number of rows."""

@@ -12,7 +12,6 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.features.features import make_measurements
 from v3d_torch.mapping.map_tables import MapTables
-from v3d_torch.mapping.tensor_table import unique_ids
 from v3d_torch.optim.reprojection import Measurements
 
 
@@ -75,3 +74,18 @@ def select_observations(tables: MapTables, window: Tensor, config: Config, *, wi
     uv, inverse_depth, octave, sigma_ratio = (table[name].index_select(0, rows) for name in names)
     measured = make_measurements(uv, inverse_depth, octave, sigma_ratio, config.tracking, config.features)
     return MapObservations(rows, keyframes, landmarks, pose, point, measured)
+
+
+def unique_ids(ids: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Unique values of non-negative integers, as `torch.unique` returns them, without sorting.
+
+    Args:
+        ids: Integers in [0, count), int64, shape :math:`(N,)`.
+        count: Exclusive upper bound of the ids.
+
+    Returns:
+        The unique ids in ascending order, int64, shape :math:`(D,)`, and the position of each id among the unique
+        ids, int64, shape :math:`(N,)`.
+    """
+    present = torch.zeros(count, dtype=torch.bool).index_fill_(0, ids, True)
+    return torch.nonzero(present)[:, 0], (present.cumsum(0) - 1).index_select(0, ids)

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.mapping.keyframe import Keyframe, Loop, stack_poses
-from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
+from v3d_torch.runtime.tensor_table import TensorTable
 
 
 class MapTables:

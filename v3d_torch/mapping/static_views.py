@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe
 
@@ -20,7 +21,7 @@ class StaticView:
 
     Attributes:
         keyframe: Keyframe whose pose is the pose of the view.
-        depth_units: Depth in units of `StaticViews.UNIT`, 0 = no measurement or not static, uint16,
+        depth_units: Depth in units of `STORED_UNIT`, 0 = no measurement or not static, uint16,
             shape :math:`(h, w)`.
         colour: RGB, uint8, shape :math:`(3, h, w)`.
         depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
@@ -44,7 +45,7 @@ class StaticView:
     @property
     def depth(self) -> Tensor:
         """Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement or not static."""
-        return self.depth_units.to(torch.float32) * StaticViews.UNIT
+        return self.depth_units.to(torch.float32) * STORED_UNIT
 
 
 class StaticViews:
@@ -63,10 +64,6 @@ class StaticViews:
         rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a pixel is the exact ray of the
             pixel of the frame from which it was sampled.
     """
-
-    UNIT = 0.0002
-    """Unit of stored depth, metres: the unit of TUM's depth images, which divides the millimetre. With 16 bits the
-    maximum is 13 m, beyond the range of RGB-D cameras."""
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
         self.stride = stride
@@ -108,7 +105,7 @@ class StaticViews:
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
         """
-        units = (depth[0, self._v, self._u] / self.UNIT).round()
+        units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
         units = torch.where(keep, units, 0).to(torch.uint16)
         self.append(StaticView(keyframe, units, image[:, self._v, self._u], depth_delay))

@@ -10,9 +10,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from v3d_torch.geometry.camera import PinholeCamera
-
-UNIT = 0.0002
-"""Unit of stored depth, metres, the same as in `StaticViews`."""
+from v3d_torch.geometry.depth_units import STORED_UNIT
 
 _MAX_UNITS = 2**16 - 1
 """Maximum stored depth, 13.1 m: rays are cast up to 10 m at most, so a larger depth shows the same free space."""
@@ -29,7 +27,7 @@ class RangeView:
     Attributes:
         row: First row.
         column: First column.
-        depth_units: Depth in units of `UNIT`, at most 13.1 m, 0 = no measurement, uint16, shape :math:`(h, w)`.
+        depth_units: Depth in units of `STORED_UNIT`, at most 13.1 m, 0 = no measurement, uint16, shape :math:`(h, w)`.
         static: Mask of samples that are static and whose neighbours are static, bool, shape :math:`(h, w)`: masks are
             inaccurate by some pixels, so samples next to a moving object can belong to it.
     """
@@ -50,7 +48,7 @@ class RangeView:
             stride: Every n-th row and column is used, from the offset on.
         """
         row, column = (int(stride * math.modf((number + 1) * step)[0]) for step in _STEPS)
-        units = (_samples(depth, row, column, stride) / UNIT).round()
+        units = (_samples(depth, row, column, stride) / STORED_UNIT).round()
         units = torch.where(units.isfinite(), units.clamp(max=_MAX_UNITS), 0).to(torch.uint16)
         moving = ~_samples(static, row, column, stride)
         near_moving = max_pool2d(moving[None].to(torch.float32), 3, 1, 1)[0] > 0
@@ -59,7 +57,7 @@ class RangeView:
     @property
     def depth(self) -> Tensor:
         """Depth, metres, float32, shape :math:`(h, w)`; 0 = no measurement."""
-        return self.depth_units.to(torch.float32) * UNIT
+        return self.depth_units.to(torch.float32) * STORED_UNIT
 
     def rays(self, camera: PinholeCamera, stride: int) -> Tensor:
         """Viewing rays of the samples at unit depth, float32, shape :math:`(h, w, 3)`."""

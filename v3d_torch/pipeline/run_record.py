@@ -13,10 +13,10 @@ from v3d_torch.datasets.readable_frames import BrokenFrame
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.live_slam import LiveResult
-from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.objects.upright_box import UprightBox
 from v3d_torch.runtime.stage_timer import StageTime
+from v3d_torch.runtime.tensor_table import TensorTable
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame, TrackingStatus
 

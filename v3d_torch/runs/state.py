@@ -14,7 +14,6 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.keyframe import Keyframe, Loop
-from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
@@ -26,6 +25,7 @@ from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.runtime.stage_timer import StageTime
+from v3d_torch.runtime.tensor_table import TensorTable
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.motion_model import PosePrediction

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from v3d_torch.geometry.se3 import interpolate, invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
-from v3d_torch.mapping.tensor_table import TensorTable
 from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.runtime.tensor_table import TensorTable
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
 _STATUSES = tuple(TrackingStatus)

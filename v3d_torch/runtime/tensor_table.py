@@ -61,18 +61,3 @@ class TensorTable:
         """Remove all rows except those in a bool mask; the remaining rows keep their order."""
         self._columns = {name: column[mask] for name, column in self.columns.items()}
         self._length = int(mask.sum())
-
-
-def unique_ids(ids: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Unique values of non-negative integers, as `torch.unique` returns them, without sorting.
-
-    Args:
-        ids: Integers in [0, count), int64, shape :math:`(N,)`.
-        count: Exclusive upper bound of the ids.
-
-    Returns:
-        The unique ids in ascending order, int64, shape :math:`(D,)`, and the position of each id among the unique
-        ids, int64, shape :math:`(N,)`.
-    """
-    present = torch.zeros(count, dtype=torch.bool).index_fill_(0, ids, True)
-    return torch.nonzero(present)[:, 0], (present.cumsum(0) - 1).index_select(0, ids)

@@ -1,4 +1,4 @@
-"""The growable table against concatenated tensors, and unique IDs against torch.unique."""
+"""The growable table against concatenated tensors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from helpers.sparse_maps import uniform
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v3d_torch.mapping.tensor_table import TensorTable, unique_ids
+from v3d_torch.runtime.tensor_table import TensorTable
 
 
 @settings(max_examples=30)
@@ -34,10 +34,3 @@ def test_writing_to_a_column_changes_the_table_and_incomplete_rows_are_rejected(
     with pytest.raises(KeyError, match="flag"):
         table.append(number=torch.arange(3))
     assert len(table) == 3
-
-
-@given(st.lists(st.integers(0, 30), max_size=40))
-def test_unique_ids_equal_torch_unique(numbers: list[int]) -> None:
-    ids = torch.tensor(numbers, dtype=torch.int64)
-    for ours, expected in zip(unique_ids(ids, 31), ids.unique(return_inverse=True), strict=True):
-        assert torch.equal(ours, expected)

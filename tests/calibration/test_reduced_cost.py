@@ -6,8 +6,8 @@ import torch
 from helpers.observed_scenes import CAMERA, Scene
 from torch import Tensor
 
+from v3d_torch.calibration.reduced_cost import differentiate_minimum_cost
 from v3d_torch.mapping.bundle_problem import prepare_bundle
-from v3d_torch.mapping.reduced_cost import differentiate_minimum_cost
 
 
 def differentiate(scene: Scene, T_cw: Tensor, points: Tensor, jacobian: Tensor) -> tuple[Tensor, Tensor]:
