@@ -6,7 +6,7 @@ It has not been tried with an installed ROS: the tests run it with stand-ins for
 ``camera/aligned_depth_to_color/image_raw``; other names are given by ``--ros-args -r OLD:=NEW``. It publishes ``/tf``,
 ``/odom``, ``/objects``, ``/cloud``, ``/path`` (see `v3d_torch.export.ros.run_messages`) and, every few seconds,
 ``/map``. The camera driver should not publish transforms of its own (``publish_tf:=false``). Parameters: ``config``,
-name or file of a configuration; ``set``, list of values such as ``segmentation.source=none``.
+name or file of a configuration; ``set``, list of values, ``occupancy.enabled=true`` if not given, as ``/map`` needs.
 """
 
 from __future__ import annotations

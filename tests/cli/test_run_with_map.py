@@ -12,9 +12,11 @@ import torch
 from helpers.commands import assert_error_line, call_here, files_in
 from helpers.walls import CAMERA, Slide
 
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.evaluation import evaluate
+from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.types import Trajectory
 
 OPTIONS = ("--segmenter", "none", "--set", "features.count=800")
@@ -78,7 +80,7 @@ def test_second_recording_is_tracked_in_the_map_of_the_first(
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     known = json.loads((results / "metrics.json").read_text())["keyframes"]
     assert (metrics["tracked"], metrics["known_keyframes"]) == (metrics["frames"], known)
-    assert f"{known} keyframes" in done.stdout
+    assert f"{known} keyframes left" in done.stdout and metrics["warnings"] == []
     keyframes = (tmp_path / "out" / "keyframes.txt").read_text().splitlines()
     assert len(keyframes) == metrics["keyframes"] and (metrics["keyframes"] == 0) == localise
     # The trajectory is in the world frame of the first recording: one alignment fits both.
@@ -88,6 +90,17 @@ def test_second_recording_is_tracked_in_the_map_of_the_first(
     # The coloured map covers both recordings.
     extent = [np.ptp(plyfile.PlyData.read(folder / "map.ply")["vertex"]["x"]) for folder in (results, tmp_path / "out")]
     assert (extent[1] > extent[0] + 0.5) != localise
+
+
+def test_map_without_views_is_warned_of(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
+    """A map that was saved with `save_map` alone gives no point map."""
+    stored = load_map(first[1], CAMERA, load_config(overrides=["features.count=800"]))
+    save_map(tmp_path / "bare.map", stored.map)
+    out = tmp_path / "out"
+    done = call_here("--seq", halves[1], *OPTIONS, "--load-map", tmp_path / "bare.map", "--localise", "--out", out)
+    assert done.exit_code == 0, done.stderr
+    warnings = json.loads((out / "metrics.json").read_text())["warnings"]
+    assert any("has no views" in warning for warning in warnings) and "has no views" in (out / "run.log").read_text()
 
 
 # --- mistakes of the user

@@ -95,7 +95,7 @@ def test_each_broken_frame_has_one_warning_on_the_console_and_in_the_log(
         warning = f"frame {index} is broken and skipped: {broken}/{reason}"
         assert done.stdout.count(f"warning: {warning}") == log.count(f"WARNING {warning}") == 1
     assert done.stdout.count("warning: ") == log.count(" WARNING ") == len(BROKEN)
-    assert f"{len(GOOD)} of {FRAMES}, {len(BROKEN)} broken ones skipped" in done.stdout
+    assert f"{len(GOOD)} of {FRAMES}, {len(BROKEN)} broken and skipped" in done.stdout
 
 
 def test_threads_give_the_same_bytes(broken: Path, serial: tuple[Path, Result], tmp_path: Path) -> None:

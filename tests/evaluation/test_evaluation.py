@@ -110,6 +110,8 @@ def test_coverage_and_json_values() -> None:
     evaluation = evaluate(groundtruth, Trajectory(groundtruth.stamps[:45], groundtruth.T_wc[:45]), frames=60)
     assert (evaluation.poses, evaluation.pairs, evaluation.coverage) == (45, 45, 0.75)
     assert evaluate(groundtruth, groundtruth).coverage is None
+    excess = evaluate(groundtruth, groundtruth, frames=59)
+    assert excess.coverage == 1 and "60 poses for 59 frames" in excess.notes[-1]
     values = json.loads(json.dumps(evaluation.to_dict()))
     assert evaluation.rpe is not None
     assert values["ate"]["rmse"] == evaluation.ate.rmse

@@ -161,11 +161,15 @@ class ParameterSelection:
 
     def _free_if_determined(self, group: ParameterGroup) -> None:
         fit = self._fit([*self.free, group])
-        if all(self._is_determined(each, fit) for each in (*self.free, group)):
+        undetermined = [each for each in (*self.free, group) if not self._is_determined(each, fit)]
+        if not undetermined:
             self.free.append(group)
             self.fit = fit
-        else:
+        elif group in undetermined:
             self._reject(group, fit, NOT_DETERMINED)
+        else:
+            others = ", ".join(name for each in undetermined for name in each.parameters)
+            self._reject(group, fit, f"cannot be told apart from {others}")
 
     def _fit(self, groups: Sequence[ParameterGroup]) -> _Fit:
         names, width = [name for group in groups for name in group.parameters], self._problem.given.width

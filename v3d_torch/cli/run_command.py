@@ -257,14 +257,14 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
     motion_states = record.dynamics.count_motion_states()
     label = label_sequence(pipeline.sequence.name, difference)
     table = Table(title=f"V3D-SLAM on {escape(label)}", show_header=False)
-    broken = f", {len(record.broken)} broken ones skipped" if record.broken else ""
+    broken = f", {len(record.broken)} broken and skipped" if record.broken else ""
     table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}{broken}")
     table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
     active = slam.map.active_keyframes
     known = sum(keyframe.is_from_earlier_run for keyframe in active)
     table.add_row("keyframes, loops", f"{len(active) - known}, {slam.loop_closer.loop_count}")
     if known:
-        table.add_row("loaded map", f"{known} keyframes")
+        table.add_row("loaded map", f"{known} keyframes left")
     table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
     if (latency := record.live.latency_statistics()) is not None:
         text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"

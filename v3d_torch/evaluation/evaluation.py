@@ -111,12 +111,14 @@ def evaluate(
         notes.append("the ground truth moves but its orientations are all the same, so they are placeholders: no RPE")
     elif rpe is None:
         notes.append(f"no two poses with ground truth are {rpe_delta:g} s apart: no RPE")
+    if frames is not None and len(estimate) > frames:
+        notes.append(f"the trajectory has {len(estimate)} poses for {frames} frames: check the number of frames")
     return Evaluation(
         ate=Statistics.of(absolute_errors(T_gc, T_ec, alignment)),
         rpe=rpe,
         pairs=len(matches),
         poses=len(estimate),
-        coverage=len(estimate) / frames if frames else None,
+        coverage=min(len(estimate) / frames, 1.0) if frames else None,
         alignment=alignment,
         notes=tuple(notes),
     )

@@ -64,7 +64,7 @@ def _invert_compiled(T: Tensor) -> Tensor:
 def invert(T: Tensor) -> Tensor:
     """Invert rigid motions, shape :math:`(..., 4, 4)`: ``invert(T_wc)`` is ``T_cw``."""
     R = T[..., :3, :3].mT
-    return _assemble(R, -(R @ T[..., :3, 3:]))
+    return _assemble(R, 0.0 - R @ T[..., :3, 3:])  # no negative zeros
 
 
 def _orthonormalise_compiled(T: Tensor) -> Tensor:

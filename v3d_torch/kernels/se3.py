@@ -30,7 +30,7 @@ def invert(T: Array) -> Array:
     for i in range(3):
         for j in range(3):
             inverse[i, j] = T[j, i]
-        inverse[i, 3] = -(T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
+        inverse[i, 3] = 0.0 - (T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
     return inverse
 
 

@@ -33,6 +33,11 @@ from v3d_torch.types import RGBDFrame, Segmenter
 
 _LOG = logging.getLogger(__name__)
 
+_NO_VIEWS = (
+    "the loaded map has no views of its keyframes: the point map and the mesh of this run lack its part;"
+    " `run --save-map` saves views"
+)
+
 
 class Run:
     """A run of one sequence, which writes all its files. The log goes to the file of `log_to`.
@@ -89,6 +94,7 @@ class Run:
             remove_unfinished(folder)
             self.pipeline.load_state_dict(checkpoint.state)
             _LOG.info("resumed after %d frames", checkpoint.frames)
+        self._lacks_views = known_map is not None and len(known_map.views) == 0
         self._autosave = Autosave(folder, self.pipeline, request if save_checkpoints else None)
 
     def __call__(self, on_frame: FrameCallback) -> Evaluation | None:
@@ -108,6 +114,8 @@ class Run:
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
         if isinstance(sequence, ImageSequence):
             self.pipeline.warn(sequence.notes)
+        if self._lacks_views:
+            self.pipeline.warn([_NO_VIEWS])
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"

@@ -2,9 +2,9 @@
 
 Networks are trained on upright images and miss people who appear lying in the image of a rolled camera. The up
 direction is estimated without a gravity sensor, by the network itself: of the four quarter turns of an image, the
-upright one gives the detections with the highest scores. A search segments all four turns, and each turn votes for a
-direction in the world frame. As the camera turns, correct votes add up and wrong votes cancel out. A few searches
-suffice, because the camera poses relate the up direction to each new frame.
+upright one gives the detections with the highest scores. In a search, each turn votes for a direction in the world
+frame. As the camera turns, correct votes add up and wrong votes cancel out. A few searches suffice, because the camera
+poses relate the up direction to each new frame.
 
 The first search segments all turns of one image. A later search takes three images, and segments each of them upright
 and in one other turn, so that a live camera does not wait for four images at once.
@@ -45,7 +45,7 @@ _GRAVITY_WEIGHT = 2 * _CONFIDENT_WEIGHT
 class UprightSegmenter:
     """Segments images of a rolled camera after rotating them upright by quarter turns.
 
-    A measured gravity gives the up direction, and its frame needs no search. Without one, all four turns are segmented
+    A measured gravity gives the up direction, and its frame needs no search. Without one, other turns are segmented too
     in some of the first calls, until the up direction is settled, and rarely afterwards.
 
     Args:
