@@ -97,7 +97,9 @@ def test_map_without_views_is_warned_of(halves: tuple[Path, Path], first: tuple[
     stored = load_map(first[1], CAMERA, load_config(overrides=["features.count=800"]))
     save_map(tmp_path / "bare.map", stored.map)
     out = tmp_path / "out"
-    done = call_here("--seq", halves[1], *OPTIONS, "--load-map", tmp_path / "bare.map", "--localise", "--out", out)
+    done = call_here(
+        "--seq", halves[1], *OPTIONS, "--load-map", tmp_path / "bare.map", "--localise", "--out", out, cwd=tmp_path
+    )
     assert done.exit_code == 0, done.stderr
     warnings = json.loads((out / "metrics.json").read_text())["warnings"]
     assert any("has no views" in warning for warning in warnings) and "has no views" in (out / "run.log").read_text()
