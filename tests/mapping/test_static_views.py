@@ -65,3 +65,14 @@ def test_view_of_a_culled_keyframe_is_left_out_also_if_no_view_is_added_later() 
     kept = [keyframes[0], keyframes[2]]
     assert [view.keyframe for view in views] == [view.keyframe for view in views.own] == kept
     assert len(views) == 2
+
+
+def test_connected_views_leave_out_disconnected_keyframes() -> None:
+    views = StaticViews(CAMERA, 2)
+    here, elsewhere = keyframe(EYE, 0), keyframe(EYE, 1)
+    for own in (here, elsewhere):
+        views.add(own, GREY, torch.full((1, 240, 320), 1.0), ALL)
+    elsewhere.part = 1
+    assert [view.keyframe for view in views.connected()] == [here] and len(views) == 2
+    elsewhere.part = 0  # a loop joined the parts
+    assert [view.keyframe for view in views.connected()] == [here, elsewhere]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import walls
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
+from helpers.walls import Slide
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
@@ -129,3 +132,32 @@ def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
     assert checked == ([] if live else [1])
     pipeline.flush()
     assert checked == ([len(pipeline.slam.poses)] if live else [1])
+
+
+class Jump:
+    """Frames at one end of a long wall, then at its other end."""
+
+    name, camera, groundtruth = "jump", walls.CAMERA, None
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        frames = [
+            frame for part in (Slide(0, 200), Slide(960, 1120)) for frame in map(part.__getitem__, range(len(part)))
+        ]
+        return (replace(frame, index=index, stamp=index / 10) for index, frame in enumerate(frames))
+
+
+def test_part_of_the_map_whose_place_is_a_guess_is_uncertain_and_not_in_the_point_map() -> None:
+    config = load_config(None, ("segmentation.source=none", "mapping.restart_after=0.3"))
+    pipeline = Pipeline(Jump(), V3DSLAM(walls.CAMERA, config=config))
+    results: list[FrameResult] = []
+    pipeline(lambda frame, result: results.append(result))
+    points = pipeline.flush().points
+    disconnected = [each for each in results if each.status is TrackingStatus.DISCONNECTED]
+    assert len(disconnected) > 10
+    for each in disconnected:  # a few tenths of a second after the last frame that was found
+        assert each.covariance[:3, :3].diagonal().sqrt().min() > 0.2
+    first, last = (walls.DISTANCE / walls.CAMERA.fx * column for column in (-159.5, 200 + 160.5))
+    assert len(points) > 1000 and first - 0.05 < points[:, 0].min() and points[:, 0].max() < last + 0.05
+    (warning,) = [each for each in pipeline.record.warnings if "only a guess" in each]
+    count = pipeline.slam.poses.statuses.count(TrackingStatus.DISCONNECTED)
+    assert count >= len(disconnected) and warning.startswith(f"{count} of {len(results)} frames")

@@ -57,3 +57,18 @@ def test_covariance_of_a_camera_not_yet_found_is_that_of_an_unknown_pose_at_any_
     for is_measured in (True, False):
         state = camera(frame_pose(EYE, TrackingStatus.LOST), is_measured=is_measured, start=start)
         torch.testing.assert_close(state.covariance.diagonal().sqrt(), expected, rtol=0.01, atol=0)
+
+
+def test_covariance_grows_while_a_camera_is_not_found_where_its_measured_motion_leads() -> None:
+    """The camera jumped to another place: its frame-to-frame motion is measured there, its pose is only a guess."""
+    camera = RestingCamera()
+    for _ in range(10):
+        state = camera(tracked())
+    before = state.covariance.diagonal().sqrt()
+    camera(frame_pose(EYE, TrackingStatus.LOST), is_measured=False)
+    for _ in range(29):
+        state = camera(frame_pose(EYE, TrackingStatus.LOST))
+    assert before.max() < 0.05
+    torch.testing.assert_close(state.covariance.diagonal().sqrt(), torch.ones(6).double(), rtol=0.1, atol=0)
+    state = camera(replace(tracked(), is_relocalised=True))
+    assert state.covariance.diagonal().sqrt().max() < 0.05

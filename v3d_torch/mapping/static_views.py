@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,6 +95,12 @@ class StaticViews:
     def own(self) -> list[StaticView]:
         """Views of this run, without those of a known map."""
         return [view for view in self if not view.keyframe.is_from_earlier_run]
+
+    def connected(self) -> StaticViews:
+        """Return these views without those of disconnected keyframes, whose place in the map is only a guess."""
+        views = copy(self)
+        views._views = [view for view in self if not view.keyframe.disconnected]
+        return views
 
     def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor, depth_delay: float = 0.0) -> None:
         """Store the static pixels of a keyframe as a view.

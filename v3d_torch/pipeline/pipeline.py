@@ -31,7 +31,7 @@ from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 from v3d_torch.runtime.process import trim_memory, trim_memory_at_intervals
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import RGBDFrame
+from v3d_torch.types import RGBDFrame, TrackingStatus
 
 _LOG = logging.getLogger(__name__)
 
@@ -222,7 +222,7 @@ class Pipeline:
                 much memory.
 
         Returns:
-            Point map of the static scene, fused from all views.
+            Point map of the static scene, fused from the views whose place in the map is known.
         """
         self.slam.flush()
         if not self.record.was_checked:
@@ -230,10 +230,18 @@ class Pipeline:
         self.warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
+        disconnected = self.slam.poses.statuses.count(TrackingStatus.DISCONNECTED)
+        if disconnected:
+            self.warn(
+                [
+                    f"{disconnected} of {len(self.slam.poses)} frames belong to a part of the map whose place is only a"
+                    " guess: point map and mesh leave it out; return to a known place to join the parts"
+                ]
+            )
         if before_fusion is not None:
             before_fusion()
         trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
-        point_map = fuse_points(self.views, self.slam.config)
+        point_map = fuse_points(self.views.connected(), self.slam.config)
         try:
             self._viewer.finish(self.slam, point_map)
         except V3DError as error:

@@ -173,10 +173,10 @@ def _peak_memory_mb() -> float | None:
 
 
 def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:
-    slam, views = pipeline.slam, pipeline.views
+    slam = pipeline.slam
     write_ply(folder / "map.ply", point_map.points, point_map.colours, normals=point_map.normals)
     if slam.config.dense_map.mesh.enabled:
-        mesh = fuse_mesh(views, slam.config.dense_map)
+        mesh = fuse_mesh(pipeline.views.connected(), slam.config.dense_map)
         write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
     if slam.occupancy is not None:
         _write_occupancy(folder, slam.occupancy)

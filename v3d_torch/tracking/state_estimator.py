@@ -34,6 +34,10 @@ _UNKNOWN = _covariance(100.0, torch.pi)
 _FIRST_FRAME_NOISE = _covariance(0.01, 0.01)
 """Noise of frames before any frame is tracked in the map: that of a frame-to-frame motion with a scene at 1 to 2 m."""
 
+_LOST_FOR_A_SECOND = _covariance(1.0, 1.0)
+"""Additional covariance of a camera that is not found for a second although its motion is measured, as after a jump to
+another place: it can be wherever it could move at walking speed."""
+
 
 class StateEstimator:
     """Estimates the state of the camera at each frame.
@@ -41,7 +45,7 @@ class StateEstimator:
     The covariance of a pose that was tracked in the map is the sum of the noise of the frame (`PoseNoise`) and of the
     map (`MapNoise`). If only the motion since the previous frame was measured, the noise of a frame is added to the
     previous covariance. Without a measured motion, the covariance grows with the uncertainty of the twist
-    (`PoseKalmanFilter`).
+    (`PoseKalmanFilter`). It also grows while a lost camera is not found where its measured motion leads.
     """
 
     def __init__(self) -> None:
@@ -52,7 +56,7 @@ class StateEstimator:
         self._owners = torch.zeros(0, dtype=torch.int64)  # keyframes that created its landmarks
         self._covariance = _UNKNOWN  # of the last pose
         self._known_covariance = _UNKNOWN  # the same without growth since the motion was last measured
-        self._last_measured = -torch.inf
+        self._last_measured = self._last_found = -torch.inf
         self._part_covariance_w = torch.zeros(6, 6, dtype=torch.float64)  # of the newest disconnected part
 
     def __call__(
@@ -79,6 +83,11 @@ class StateEstimator:
         else:
             self._pose_noise.interrupt()
             self._covariance = _transform(self._covariance, motion.T_cp) + self._frame_noise
+            if status is TrackingStatus.LOST and self._last_found > -torch.inf:
+                lost_before, lost = self._filter.stamp - self._last_found, stamp - self._last_found
+                self._covariance = self._covariance + (lost**2 - lost_before**2) * _LOST_FOR_A_SECOND
+        if pose.information is not None or defines_world:
+            self._last_found = stamp
         if pose.information is not None or defines_world or motion.is_measured:
             self._filter_measured(stamp, T_wc, motion, is_continuous=not pose.is_relocalised)
             self._known_covariance, self._last_measured = self._covariance, stamp
@@ -119,6 +128,7 @@ class StateEstimator:
             "covariance": self._covariance,
             "known_covariance": self._known_covariance,
             "last_measured": self._last_measured,
+            "last_found": self._last_found,
             "part_covariance_w": self._part_covariance_w,
         }
 
@@ -129,7 +139,8 @@ class StateEstimator:
         self._filter.load_state_dict(state["filter"])
         self._frame_noise, self._owners = state["frame_noise"], state["owners"]
         self._covariance, self._known_covariance = state["covariance"], state["known_covariance"]
-        self._last_measured, self._part_covariance_w = state["last_measured"], state["part_covariance_w"]
+        self._last_measured, self._last_found = state["last_measured"], state["last_found"]
+        self._part_covariance_w = state["part_covariance_w"]
 
     def _track(self, information: Tensor, stamp: float, T_wc: Tensor, owners: Tensor) -> Tensor:
         """Covariance of a pose that was tracked in the map."""
