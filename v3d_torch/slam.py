@@ -33,7 +33,7 @@ from v3d_torch.occupancy.up_estimator import UpEstimator
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
-from v3d_torch.runtime.input_checks import check_order
+from v3d_torch.runtime.input_checks import check_next
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation import NoSegmentation
@@ -200,10 +200,11 @@ class V3DSLAM(FramePreprocessor):
             preprocessed: Result of `preprocess` for the next frame.
 
         Raises:
-            InputError: If the frame is not later than the previous one.
+            InputError: If the frame is not later than the previous one, or the depth of the first frame is not in
+                metres.
         """
         frame, depth = preprocessed.frame, preprocessed.extraction.depth
-        check_order(frame, self.poses.stamp)
+        check_next(frame, self.poses.stamp)
         self.timer.add(preprocessed.times)
         with self.timer("odometry"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -67,6 +68,16 @@ def test_frame_of_another_camera_is_rejected() -> None:
     with pytest.raises(InputError, match=message):
         slam(replace(FRAME, stamp=3.0, camera=other))
     assert len(slam.poses.statuses) == 1
+
+
+@pytest.mark.parametrize(("depth", "message"), [(1220.0, "1.2e+03 m; give depth in metres"), (0.001, "0.001 m")])
+def test_first_depth_that_is_not_in_metres_is_rejected(depth: float, message: str) -> None:
+    """Floating-point depth in millimetres tracked nothing, without a word."""
+    slam = make_slam()
+    with pytest.raises(InputError, match=re.escape(f"frame 7: its median depth is {message}")):
+        slam(replace(FRAME, depth=torch.full((1, 48, 64), depth)))
+    slam(replace(FRAME, depth=torch.zeros(1, 48, 64)))  # a covered lens
+    slam(replace(FRAME, stamp=2.1, depth=torch.full((1, 48, 64), 0.02)))  # a later frame can be close to a wall
 
 
 @pytest.mark.parametrize("stamp", [2.0, 1.9])

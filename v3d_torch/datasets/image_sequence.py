@@ -14,11 +14,7 @@ from torch import Tensor
 from v3d_torch.datasets.stored import StoredSequence, max_broken_frames
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.depth_scale import estimate_depth_scale
-from v3d_torch.geometry.depth_units import depth_to_metres
-
-_MIN_MEDIAN_DEPTH, _MAX_MEDIAN_DEPTH = 0.05, 50.0
-"""Plausible range of the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
-wrong depth scale gives values outside of it."""
+from v3d_torch.geometry.depth_units import depth_to_metres, implausible_median
 
 _SAMPLES = 8
 """Number of frames from which an unknown depth scale is estimated."""
@@ -61,8 +57,8 @@ class ImageSequence(StoredSequence):
                 f" {_explain_missing(missing[0])}"
             )
         first, depth = self._read_first(max_broken_frames(len(self)) if skip_broken else 0)
-        median = float(depth[depth > 0].median()) if bool((depth > 0).any()) else 1.0
-        if _MIN_MEDIAN_DEPTH < median < _MAX_MEDIAN_DEPTH:
+        median = implausible_median(depth)
+        if median is None:
             return
         found = f"{source}: the median depth of the first frame is {median:.2g} m"
         if self._read_depth(first).dtype.kind == "f" or self.camera.depth_scale is None:

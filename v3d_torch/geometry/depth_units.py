@@ -18,6 +18,10 @@ millimetre. The maximum is 13 m, beyond the range of RGB-D cameras."""
 SATURATED_DEPTH = np.iinfo(np.uint16).max
 """Largest 16-bit depth value. No camera measures this value, and some datasets write it for missing depth."""
 
+_MIN_MEDIAN, _MAX_MEDIAN = 0.05, 50.0
+"""Plausible range of the median depth of an image, metres: wider than the range of any RGB-D camera, so that only a
+wrong unit gives values outside of it."""
+
 _MAX_METRES = 1e4
 """Floating-point depth above this is not a measurement, metres: renderers write such values for the sky."""
 
@@ -53,3 +57,14 @@ def depth_to_metres(depth: NDArray[Any], depth_scale: float | None) -> Tensor:
 def missing_value(depth: NDArray[np.integer[Any]]) -> int:
     """Return the value of pixels without measurement in an image of this type."""
     return SATURATED_DEPTH if depth.dtype.kind == "u" and depth.dtype.itemsize == 2 else 0
+
+
+def implausible_median(depth: Tensor) -> float | None:
+    """Return the median depth of an image, metres, if it shows that the unit is wrong; else None.
+
+    Args:
+        depth: Depth, metres, any shape; values that are not positive are not measurements.
+    """
+    measured = depth[depth > 0]
+    median = float(measured.median()) if len(measured) else 1.0
+    return None if _MIN_MEDIAN < median < _MAX_MEDIAN else median

@@ -228,6 +228,7 @@ class Pipeline:
         if not self.record.was_checked:
             self._check_plausibility()
         self.warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
+        self.warn(self.record.repeated.check(len(self.slam.poses)))
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
         disconnected = self.slam.poses.statuses.count(TrackingStatus.DISCONNECTED)
@@ -304,6 +305,7 @@ class Pipeline:
             self.record.broken.append(frames.broken.popleft())
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
+        self.record.repeated.add(frame.image)
         self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result, self.slam.up)
         self._evaluate_masks(frame, result)

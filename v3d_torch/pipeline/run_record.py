@@ -15,6 +15,7 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.live_slam import LiveResult
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.objects.upright_box import UprightBox
+from v3d_torch.pipeline.repeated_images import RepeatedImages
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.runtime.tensor_table import TensorTable
 from v3d_torch.tracking.camera_state import CameraState
@@ -224,6 +225,7 @@ class RunRecord:
         save_error: Reason why a checkpoint could not be written; None if there was no error.
         warnings: Contradictions between the images and the camera, notes on the source, and map files that were not
             written, one sentence each.
+        repeated: Images that repeat the one before.
         people_sizes: Apparent sizes of people in the keyframes before the check, metres.
         was_checked: True if camera and depth were checked.
     """
@@ -243,5 +245,6 @@ class RunRecord:
     mask_error: str | None = None
     save_error: str | None = None
     warnings: list[str] = field(default_factory=list)
+    repeated: RepeatedImages = field(default_factory=RepeatedImages)
     people_sizes: list[float] = field(default_factory=list)
     was_checked: bool = False

@@ -22,6 +22,7 @@ from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.static_views import StaticView
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline.repeated_images import RepeatedImages
 from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable, RunRecord, Snapshot, StateTable
 from v3d_torch.runs.metrics_file import read_metrics, suggest_folder
 from v3d_torch.runs.request import RunRequest
@@ -37,6 +38,7 @@ _CLASSES = (
         BrokenFrame,
         FrameTimes,
         LiveTable,
+        RepeatedImages,
         ObjectTable,
         StateTable,
         Snapshot,

@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import implausible_median
 from v3d_torch.types import Instances, RGBDFrame
 
 _MAX_NORM_ERROR = 1e-3
@@ -78,12 +79,18 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
         )
 
 
-def check_order(frame: RGBDFrame, previous_stamp: float) -> None:
-    """Check that a frame is later than the previous one.
+def check_next(frame: RGBDFrame, previous_stamp: float) -> None:
+    """Check that a frame is later than the previous one, and that the depth of the first frame is in metres.
+
+    Args:
+        frame: Frame.
+        previous_stamp: Time of the previous frame, seconds; minus infinity before the first.
 
     Raises:
-        InputError: If the frame is not later than the previous one.
+        InputError: If the frame is not later, or the median depth of the first frame is implausible.
     """
+    if previous_stamp == -math.inf and (median := implausible_median(frame.depth)) is not None:
+        raise InputError(f"frame {frame.index}: its median depth is {median:.2g} m; give depth in metres")
     if frame.stamp <= previous_stamp:
         raise InputError(
             f"frame {frame.index}: its stamp, {frame.stamp:.6f} s, is not after {previous_stamp:.6f} s, that of the"

@@ -1,0 +1,70 @@
+"""Images that repeat the one before: counted, and warned of if the others move."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.wall_run import CAMERA, FRAMES, Wall, square
+from torch import Tensor
+
+from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline.repeated_images import RepeatedImages
+from v3d_torch.slam import V3DSLAM
+from v3d_torch.types import RGBDFrame
+
+
+def picture(seed: int) -> Tensor:
+    return torch.randint(0, 255, (3, 48, 64), generator=torch.Generator().manual_seed(seed)).to(torch.uint8)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "count", "is_warned_of"),
+    [
+        (range(40), 0, False),
+        ([*range(20), *range(18, 38)], 0, False),  # an image that returns is no repetition
+        ([0, 0, *range(1, 39)], 1, False),
+        ([number // 2 for number in range(40)], 20, True),
+        ([0] * 40, 39, False),  # a still camera without noise
+        ([*[0] * 30, *range(1, 11)], 29, True),
+    ],
+)
+def test_many_repeated_images_are_warned_of(numbers: list[int], count: int, is_warned_of: bool) -> None:
+    repeated = RepeatedImages()
+    for number in numbers:
+        repeated.add(picture(number))
+    assert repeated.count == count
+    warnings = repeated.check(len(numbers))
+    assert [warning.startswith(f"{count} of {len(numbers)} images are equal") for warning in warnings] == (
+        [True] * is_warned_of
+    )
+
+
+def test_one_pixel_makes_another_image() -> None:
+    repeated = RepeatedImages()
+    image = picture(0)
+    repeated.add(image)
+    changed = image.clone()
+    changed[1, 5, 7] ^= 1
+    repeated.add(changed)
+    assert repeated.count == 0
+
+
+class Stutter:
+    """Each frame along the wall twice, with a stamp of its own."""
+
+    name, camera, groundtruth = "stutter", CAMERA, None
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        wall = Wall()
+        for index in range(2 * FRAMES):
+            yield replace(wall[index // 2], index=index, stamp=index / 20)
+
+
+def test_run_with_repeated_images_has_a_warning() -> None:
+    pipeline = Pipeline(Stutter(), V3DSLAM(CAMERA, square))
+    pipeline()
+    pipeline.flush()
+    assert any(f"{FRAMES} of {2 * FRAMES} images are equal" in warning for warning in pipeline.record.warnings)
