@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource
+from v3d_torch.evaluation.evaluation import absent_scores
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
 
@@ -117,6 +118,7 @@ def test_coverage_and_json_values() -> None:
     assert values["ate"]["rmse"] == evaluation.ate.rmse
     assert values["rpe"]["trans"]["rmse"] == evaluation.rpe.trans.rmse
     assert values["rpe"]["rot"]["std"] == evaluation.rpe.rot.std
+    assert absent_scores(45, 60).keys() == values.keys() and absent_scores(45, 60)["coverage"] == 0.75
     assert values["coverage"] == 0.75 and values["alignment"]["rotation_from"] == "positions"
 
 

@@ -211,8 +211,8 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
     without_truth.record = replace(run.record)
     assert write_results(tmp_path, without_truth, without_truth.flush()) is None
     metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert "rmse" not in (metrics.get("ate") or {})
-    assert metrics["frames"] == FRAMES
+    assert metrics["ate"] is metrics["rpe"] is metrics["alignment"] is None and metrics["notes"] == []
+    assert (metrics["frames"], metrics["poses"], metrics["coverage"], metrics["pairs"]) == (FRAMES, FRAMES, 1.0, 0)
     assert (tmp_path / "figures" / "trajectory.png").is_file()
     assert not (tmp_path / "groundtruth.txt").exists()
 

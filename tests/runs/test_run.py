@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import logging
 from pathlib import Path
 
 import pytest
+import torch
 from helpers.wall_run import FRAMES, Wall, square
 
 from v3d_torch.config import Config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runs.metrics_file import read_metrics
+from v3d_torch.runs.report_page import render_page
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.stored_run import read_run
+from v3d_torch.types import RGBDFrame
 
 
 def test_poses_and_sparse_map_are_written_before_the_point_map_is_fused(
@@ -31,3 +37,25 @@ def test_poses_and_sparse_map_are_written_before_the_point_map_is_fused(
     assert {"states.parquet", "dynamics.parquet", "room.npz"} <= {path.name for path in tmp_path.iterdir()}
     failure = read_metrics(tmp_path / "metrics.json").failure
     assert failure == f"killed or still running after {FRAMES} of {FRAMES} frames"
+
+
+class WallWithoutDepth(Wall):
+    """The wall as seen by a depth camera that measures nothing."""
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame = super().__getitem__(index)
+        return RGBDFrame(frame.index, frame.stamp, frame.image, torch.zeros_like(frame.depth))
+
+
+def test_run_that_never_finds_the_camera_stores_the_cause_and_no_scores(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = Run(RunRequest("wall", Config()), WallWithoutDepth(), square, tmp_path)
+    with caplog.at_level(logging.ERROR, "v3d_torch"):
+        assert run(lambda *_: None) is None
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["ate"], metrics["lost"], metrics["failure"]) == (None, FRAMES, None)
+    cause = f"wall: the camera was not found in any of the {FRAMES} frames"
+    page = render_page(read_run(tmp_path))
+    assert all(text.count(cause) == 1 for text in (metrics["diagnosis"], caplog.text, page))
+    assert "ATE RMSE" not in page and "The camera was not found in any frame" in page

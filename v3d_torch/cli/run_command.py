@@ -25,7 +25,6 @@ from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
-from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
@@ -237,13 +236,8 @@ def _print_summary(
         frames = len(pipeline.slam.poses)
         results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"
         raise InputError(f"{record.failure} ({results})")
-    if request.load_map is not None and not pipeline.slam.poses.is_localised:
-        raise InputError(
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
-            f" run without --load-map (the results are in {folder})"
-        )
-    if (problem := diagnose(pipeline, evaluation)) is not None:
-        raise InputError(f"{problem} (the results are in {folder})")
+    if record.diagnosis is not None:
+        raise InputError(f"{record.diagnosis} (the results are in {folder})")
 
 
 def _way_to_resume(folder: Path) -> str:

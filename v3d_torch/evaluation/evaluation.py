@@ -118,10 +118,21 @@ def evaluate(
         rpe=rpe,
         pairs=len(matches),
         poses=len(estimate),
-        coverage=min(len(estimate) / frames, 1.0) if frames else None,
+        coverage=_coverage(len(estimate), frames),
         alignment=alignment,
         notes=tuple(notes),
     )
+
+
+def absent_scores(poses: int, frames: int | None) -> dict[str, Any]:
+    """Return the values of `Evaluation.to_dict` for a trajectory that cannot be compared with a ground truth.
+
+    Args:
+        poses: Number of estimated poses.
+        frames: Number of frames of the sequence; None if it is not known.
+    """
+    absent = dict.fromkeys(("ate", "rpe", "alignment"))
+    return {**absent, "pairs": 0, "poses": poses, "coverage": _coverage(poses, frames), "notes": []}
 
 
 def has_orientations(trajectory: Trajectory) -> bool:
@@ -134,6 +145,10 @@ def has_orientations(trajectory: Trajectory) -> bool:
     turns = not torch.allclose(T_wc[:, :3, :3], T_wc[:1, :3, :3], rtol=0, atol=1e-9)
     moves = not torch.allclose(T_wc[:, :3, 3], T_wc[:1, :3, 3], rtol=0, atol=1e-9)
     return turns or not moves
+
+
+def _coverage(poses: int, frames: int | None) -> float | None:
+    return min(poses / frames, 1.0) if frames else None
 
 
 def _suggest(true: float, estimated: float) -> str:

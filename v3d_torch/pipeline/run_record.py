@@ -220,6 +220,7 @@ class RunRecord:
         broken: Broken frames that were skipped.
         seconds: Wall time of all frames, seconds.
         failure: Reason why the run ended before the end of the sequence; None if it did not.
+        diagnosis: Cause of incomplete results of a run that reached the end of the sequence; None if they are complete.
         interrupted: True if the user interrupted the run.
         mask_error: Reason why the masks were not evaluated although there are true masks; None if there was no error.
         save_error: Reason why a checkpoint could not be written; None if there was no error.
@@ -241,6 +242,7 @@ class RunRecord:
     broken: list[BrokenFrame] = field(default_factory=list)
     seconds: float = 0.0
     failure: str | None = None
+    diagnosis: str | None = None
     interrupted: bool = False
     mask_error: str | None = None
     save_error: str | None = None

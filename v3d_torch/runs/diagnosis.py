@@ -7,10 +7,10 @@ import numpy as np
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation import Evaluation, evaluate
+from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.types import TrackingStatus
+from v3d_torch.runs.request import RunRequest
 
 _SAMPLES = 5
 """Number of frames that are examined."""
@@ -21,24 +21,31 @@ _MAX_PLAIN_SIGMA = 4.0
 _MAX_EMPTY_FRACTION = 0.01
 """Maximum fraction of pixels with depth in a depth image without content."""
 
+_MIN_IMAGE_SIZE = 96
+"""Minimum number of rows and of columns of an image in which enough features are found in most scenes."""
 
-def diagnose(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
+
+def diagnose(pipeline: Pipeline, request: RunRequest) -> str | None:
     """Explain incomplete results of a run that ended without an error.
 
     Args:
         pipeline: Pipeline that has run.
-        evaluation: Its scores; None without ground truth.
+        request: Inputs of the run.
 
     Returns:
         One sentence with cause and fix; None if the results are complete.
     """
-    statuses = pipeline.slam.poses.statuses
-    name = pipeline.sequence.name
-    if not statuses:
+    name, count = pipeline.sequence.name, len(pipeline.slam.poses)
+    if not count:
         return f"{name}: has no frames; record it again"
-    if all(status is TrackingStatus.LOST for status in statuses):
-        return f"{name}: the camera was not found in any of the {len(statuses)} frames, {_cause_of_loss(pipeline)}"
-    return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
+    if pipeline.slam.poses.is_localised:
+        return pipeline.record.mask_error or _cause_of_missing_scores(pipeline)
+    if request.load_map is not None:
+        return (
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
+            " run without --load-map"
+        )
+    return f"{name}: the camera was not found in any of the {count} frames, {_cause_of_loss(pipeline)}"
 
 
 def _cause_of_loss(pipeline: Pipeline) -> str:
@@ -49,23 +56,37 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
         frames = [sequence[int(indices[sample])] for sample in samples]
         if all(float(frame.image.float().std()) < _MAX_PLAIN_SIGMA for frame in frames):
             return "the colour images are uniform; record it again, with light and an uncovered lens"
-        if all(float((frame.depth > 0).float().mean()) < _MAX_EMPTY_FRACTION for frame in frames):
+        fractions = [float((frame.depth > 0).float().mean()) for frame in frames]
+        if not any(fractions):
             return "the depth images are empty; record or export them again"
+        if max(fractions) < _MAX_EMPTY_FRACTION:
+            return (
+                f"at most {100 * max(fractions):.2g}% of the pixels have depth; record again within the range of the"
+                " depth camera, or export the depth again"
+            )
         if all(
             float(((frame.depth > 0) & (frame.depth < max_depth)).float().mean()) < _MAX_EMPTY_FRACTION
             for frame in frames
         ):
-            return f"all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise features.max_depth"
+            return (
+                f"nearly all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise"
+                " features.max_depth"
+            )
+    if min(sequence.camera.width, sequence.camera.height) < _MIN_IMAGE_SIZE:
+        return (
+            f"images of {sequence.camera.width}x{sequence.camera.height} pixels have too few features; use images of at"
+            f" least {_MIN_IMAGE_SIZE} rows and columns"
+        )
     if len(pipeline.record.dynamics):
         return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 
 
-def _cause_of_missing_scores(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
+def _cause_of_missing_scores(pipeline: Pipeline) -> str | None:
     sequence, trajectory = pipeline.sequence, pipeline.slam.poses.trajectory()
     if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
         return str(sequence.groundtruth_error)
-    if evaluation is None and sequence.groundtruth is not None and len(trajectory) >= MIN_PAIRS:
+    if sequence.groundtruth is not None and len(trajectory) >= MIN_PAIRS:
         try:
             evaluate(sequence.groundtruth, trajectory)
         except InputError as error:

@@ -34,6 +34,7 @@ class Metrics(BaseModel):
     landmarks: int
     loops: int
     failure: str | None
+    diagnosis: str | None = None
     difference: str | None = None
     fps: float | None
     seconds: float
@@ -43,6 +44,11 @@ class Metrics(BaseModel):
     masks: dict[str, Any] | None = None
     versions: dict[str, str | None]
     machine: dict[str, Any]
+
+    @property
+    def is_localised(self) -> bool:
+        """True if the camera was found in any frame."""
+        return any(status is not TrackingStatus.LOST for status in self.status)
 
 
 def read_metrics(path: Path) -> Metrics:

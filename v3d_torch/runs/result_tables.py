@@ -56,7 +56,7 @@ class ResultTables:
         trajectory: Poses of all frames.
         keyframes: Poses of the keyframes of the run.
         groundtruth: True poses, if there are any.
-        evaluation: Scores, if there is ground truth and there are enough poses.
+        evaluation: Scores, if there is ground truth, the camera was found, and there are enough poses.
         config: Configuration, YAML.
         frames: Table of frames.
         states: Table of the states of the camera.
@@ -95,7 +95,7 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
     keyframes = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     evaluation = None
-    if groundtruth is not None:
+    if groundtruth is not None and slam.poses.is_localised:
         with suppress(InputError):  # too few poses for scores
             evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count)
     return ResultTables(

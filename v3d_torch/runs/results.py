@@ -18,6 +18,7 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.evaluation import absent_scores
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.io.files import write_text
 from v3d_torch.io.ply import write_ply
@@ -113,7 +114,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
     counts = {status.value: statuses.count(status) for status in TrackingStatus}
     masks = run.mask_evaluation.compute_scores()
     return {
-        **(evaluation.to_dict() if evaluation is not None else {"ate": None, "rpe": None}),
+        **(absent_scores(frames, pipeline.frame_count) if evaluation is None else evaluation.to_dict()),
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
         "difference": describe_difference(pipeline.sequence),
@@ -133,6 +134,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "T_lw": None if (T_lw := slam.T_lw) is None else T_lw.tolist(),
         "failure": failure,
+        "diagnosis": run.diagnosis,
         "latency": run.live.latency_statistics(),
         "dropped": run.live.dropped,
         "rejected": run.rejected,

@@ -23,6 +23,7 @@ from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
+from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
@@ -79,6 +80,7 @@ class Run:
         system = CheckedSLAM if config.check_numerics else V3DSLAM
         slam = system(sequence.camera, segment, config, None if known_map is None else known_map.map)
         self._folder = folder
+        self._request = request
         self._is_resumed = checkpoint is not None
         self._map_file = None if request.save_map is None else Path(request.save_map)
         self.pipeline = Pipeline(
@@ -105,7 +107,8 @@ class Run:
 
         Returns:
             The scores, if there is ground truth. If the run ended early, or the map file cannot be written,
-            ``pipeline.record.failure`` is the reason, and the last checkpoint stays.
+            ``pipeline.record.failure`` is the reason, and the last checkpoint stays. If the results of a whole run are
+            incomplete, ``pipeline.record.diagnosis`` is the cause.
 
         Raises:
             OutputError: If the results cannot be written.
@@ -129,10 +132,12 @@ class Run:
         point_map = self.pipeline.flush(lambda: self._save_poses(is_whole=is_whole))
         from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
 
+        if record.failure is None:
+            record.diagnosis = diagnose(self.pipeline, self._request)
         evaluation = write_results(self._folder, self.pipeline, point_map)
         self._autosave.discard()
-        if record.failure:
-            _LOG.error(record.failure)
+        if problem := record.failure or record.diagnosis:
+            _LOG.error(problem)
         return evaluation
 
     def _save_poses(self, *, is_whole: bool) -> None:

@@ -28,7 +28,8 @@ class StoredRun:
         trajectory: Pose of each processed frame; None if the file is missing or the run has no frames.
         keyframes: Poses of the keyframes; None if there are none.
         groundtruth: True poses; None if there are none.
-        evaluation: Scores; None without ground truth, or if fewer than three poses have ground truth.
+        evaluation: Scores; None without ground truth, if fewer than three poses have ground truth, or if the camera was
+            not found in any frame.
         frames: Table with one row per frame; None if the file is missing.
         dynamics: Table with one row per frame and object; None if the file is missing.
         config_text: Text of the configuration file; empty if it is missing.
@@ -78,7 +79,7 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     truth_path = groundtruth or folder / "groundtruth.txt"
     truth = read_trajectory(truth_path) if groundtruth is not None or truth_path.is_file() else None
     evaluation = None
-    if truth is not None and trajectory is not None:
+    if truth is not None and trajectory is not None and metrics.is_localised:
         try:
             evaluation = evaluate(truth, trajectory, frames=metrics.frames)
         except InputError as error:

@@ -67,6 +67,27 @@ CASES = [
         fails_after_run(NO_DEPTH),
     ),
     Case(
+        "depth in a corner only",
+        every(DEPTH, lambda i: png(depth() * (np.indices((HEIGHT, WIDTH)).max(axis=0) < 10))),
+        fails_after_run(
+            "seq: the camera was not found in any of the 8 frames, at most 0.81% of the pixels have depth; record again"
+            " within the range of the depth camera, or export the depth again"
+        ),
+    ),
+    Case(
+        "images of 64x48 pixels",
+        all_of(
+            every(RGB, lambda i: png(colour(*camera_position(i))[:48, :64])),
+            every(DEPTH, lambda i: png(depth()[:48, :64])),
+            edit("camera.yaml", replace_text("width: 128", "width: 64")),
+            edit("camera.yaml", replace_text("height: 96", "height: 48")),
+        ),
+        fails_after_run(
+            "seq: the camera was not found in any of the 8 frames, images of 64x48 pixels have too few features; use"
+            " images of at least 96 rows and columns"
+        ),
+    ),
+    Case(
         "black without depth",
         all_of(every(RGB, lambda i: plain(0)), every(DEPTH, lambda i: png(depth(0.0)))),
         fails_after_run(UNIFORM),
