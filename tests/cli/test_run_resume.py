@@ -252,16 +252,18 @@ def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
     assert_same_results(out, whole_run)
 
 
-def test_run_without_keyframes_keeps_an_earlier_map_file(sequence: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("earlier", [b"the map of yesterday", None])
+def test_run_without_keyframes_writes_no_map_file(earlier: bytes | None, sequence: Path, tmp_path: Path) -> None:
     dark, room = tmp_path / "dark", tmp_path / "room.map"
     shutil.copytree(sequence, dark)
     for path in (dark / "rgb").iterdir():
         path.write_bytes(base.png(np.zeros_like(cv2.imread(str(path)))))
-    room.write_bytes(b"the map of yesterday")
+    if earlier is not None:
+        room.write_bytes(earlier)
     done = call(*run_arguments(dark, tmp_path / "out", "--save-map", str(room)))
     assert_error_line(done, "the colour images are uniform")
-    assert f"warning: {room}: was not overwritten, because the map of this run has no keyframes\n" in done.stdout
-    assert room.read_bytes() == b"the map of yesterday"
+    assert f"warning: {room}: was not written, because the map of this run has no keyframes\n" in done.stdout
+    assert (room.read_bytes() if room.exists() else None) == earlier
 
 
 # --- mistakes of the user

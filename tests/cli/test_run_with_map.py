@@ -17,6 +17,7 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.evaluation import evaluate
 from v3d_torch.mapping.map_io import load_map, save_map
+from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.types import Trajectory
 
 OPTIONS = ("--segmenter", "none", "--set", "features.count=800")
@@ -105,6 +106,14 @@ def test_map_without_views_is_warned_of(halves: tuple[Path, Path], first: tuple[
     assert any("has no views" in warning for warning in warnings) and "has no views" in (out / "run.log").read_text()
 
 
+def test_a_single_keyframe_that_is_left_is_in_the_singular(tmp_path: Path) -> None:
+    recording = write_sequence(tmp_path / "short", Slide(600, 640, step=20))
+    for options in (("--save-map", "one.map"), ("--load-map", "one.map", "--localise")):
+        done = call_here("--seq", recording, *OPTIONS, *options, "--out", "out", cwd=tmp_path)
+        assert done.exit_code == 0, done.stderr
+    assert " 1 keyframe left " in done.stdout
+
+
 # --- mistakes of the user
 
 
@@ -118,6 +127,14 @@ def test_damaged_map_file_is_rejected(halves: tuple[Path, Path], first: tuple[Pa
     done = call_here("--seq", halves[1], *OPTIONS, "--load-map", "half.map", cwd=tmp_path)
     assert_error_line(done, "half.map", "--save-map")
     assert files_in(tmp_path) == {"half.map"}
+
+
+def test_map_without_keyframes_is_rejected(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    config = load_config(overrides=["features.count=800"])
+    save_map(tmp_path / "none.map", SparseMap(config.mapping, config.features, CAMERA))
+    done = call_here("--seq", halves[1], *OPTIONS, "--load-map", "none.map", cwd=tmp_path)
+    assert_error_line(done, "none.map: has no keyframes")
+    assert files_in(tmp_path) == {"none.map"}
 
 
 def test_map_of_another_room_is_reported_after_the_results(first: tuple[Path, Path], tmp_path: Path) -> None:

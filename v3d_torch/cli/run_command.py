@@ -160,6 +160,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     known_map = None
     if request.load_map is not None and checkpoint is None:  # a checkpoint contains the map
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
+        if not known_map.map.active_keyframes:
+            raise InputError(f"{request.load_map}: has no keyframes; give the map of a run that found the camera")
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
     if isinstance(segment, MaskFolder) and isinstance(sequence, Sized) and checkpoint is None:
         segment.check_number(len(sequence))
@@ -217,7 +219,7 @@ def _print_summary(
     """
     record = pipeline.record
     difference = describe_difference(pipeline.sequence)
-    console.print(_summary_table(pipeline, evaluation, difference))
+    console.print(_summary_table(request, pipeline, evaluation, difference))
     if record.failure is not None and len(pipeline.slam.poses) + len(record.broken) < pipeline.frame_count:
         difference = difference or f"part: {len(pipeline.slam.poses)} of {pipeline.frame_count} frames"
     paper = None if evaluation is None else make_paper_table(pipeline.sequence.name, evaluation, difference)
@@ -245,7 +247,9 @@ def _way_to_resume(folder: Path) -> str:
     return f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
 
 
-def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference: str | None) -> Table:
+def _summary_table(
+    request: RunRequest, pipeline: Pipeline, evaluation: Evaluation | None, difference: str | None
+) -> Table:
     slam, record = pipeline.slam, pipeline.record
     statuses = Counter(slam.poses.statuses)
     motion_states = record.dynamics.count_motion_states()
@@ -257,8 +261,8 @@ def _summary_table(pipeline: Pipeline, evaluation: Evaluation | None, difference
     active = slam.map.active_keyframes
     known = sum(keyframe.is_from_earlier_run for keyframe in active)
     table.add_row("keyframes, loops", f"{len(active) - known}, {slam.loop_closer.loop_count}")
-    if known:
-        table.add_row("loaded map", f"{known} keyframes left")
+    if request.load_map is not None:
+        table.add_row("loaded map", f"{known} {'keyframe' if known == 1 else 'keyframes'} left")
     table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
     if (latency := record.live.latency_statistics()) is not None:
         text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"

@@ -154,8 +154,8 @@ class Run:
         """Write the map file; a part of a map is written beside a map file that exists, and does not replace it."""
         pipeline, target = self.pipeline, path
         beside = path.with_name(f"{path.stem}.partial{path.suffix}")
-        if path.exists() and not pipeline.slam.map.active_keyframes:
-            pipeline.warn([f"{path}: was not overwritten, because the map of this run has no keyframes"])
+        if not pipeline.slam.map.active_keyframes:
+            pipeline.warn([f"{path}: was not written, because the map of this run has no keyframes"])
             return
         if path.exists() and not is_whole:
             target = beside
