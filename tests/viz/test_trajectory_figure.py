@@ -79,6 +79,21 @@ def test_curve_has_gap_where_poses_are_missing(tmp_path: Path) -> None:
     assert line.count("M") == 2
 
 
+@pytest.mark.parametrize("truth", [None, arc()])
+def test_guessed_poses_are_dotted(truth: Trajectory | None, tmp_path: Path) -> None:
+    """The dotted curve joins the measured ones, whose gap has the length of the guessed part."""
+    statuses = 20 * ["tracked"] + 15 * ["lost"] + 5 * ["disconnected"] + 20 * ["odometry"]
+    save_trajectory_figure(truth, arc(), tmp_path / "figure.svg", statuses=statuses)
+    drawing = (tmp_path / "figure.svg").read_text()
+    assert "<!-- estimate, disconnected or lost -->" in drawing
+    measured = re.findall(r'<path d="([^"]+)"[^>]*stroke: #1f77b4', drawing)[0]
+    dotted = re.findall(r'<path d="([^"]+)"[^>]*stroke-dasharray[^>]*stroke: #ff7f0e', drawing)[0]
+    ends = [part.split("L")[index].split() for part, index in zip(measured.split("M")[1:], (-1, 0), strict=True)]
+    assert [part.split() for part in (dotted[1:].split("L")[0], dotted.split("L")[-1])] == ends
+    save_trajectory_figure(truth, arc(), tmp_path / "figure.svg", statuses=60 * ["tracked"])
+    assert "disconnected" not in (tmp_path / "figure.svg").read_text()
+
+
 def test_same_trajectory_gives_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         save_trajectory_figure(arc(), shaken(arc()), tmp_path / f"{name}.png")

@@ -111,7 +111,9 @@ def _pose_plots(run: StoredRun) -> dict[str, str]:
     if estimate is None:
         return {}
     plots = {
-        "trajectory": embed_svg(draw_trajectory(truth if evaluation else None, estimate), "trajectory"),
+        "trajectory": embed_svg(
+            draw_trajectory(truth if evaluation else None, estimate, statuses=run.metrics.status), "trajectory"
+        ),
         "positions": embed_svg(draw_positions(truth, estimate, evaluation), "positions"),
     }
     if truth is not None and evaluation is not None:

@@ -35,7 +35,9 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
         OutputError: If an image cannot be written.
     """
     sequence, record = pipeline.sequence, pipeline.record
-    save_trajectory_figure(sequence.groundtruth, trajectory, folder / "trajectory.png", sequence.name)
+    poses = pipeline.slam.poses
+    groundtruth = sequence.groundtruth if poses.is_localised else None  # lost poses cannot be aligned to it
+    save_trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", sequence.name, poses.statuses)
     if record.snapshots:
         images = [snapshot.frame.image for snapshot in record.snapshots]
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]

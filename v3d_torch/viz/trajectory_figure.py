@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,11 +31,16 @@ _MIN_HALF_RANGE = 0.01
 _MARGIN = 1.1
 """Width of the view divided by the extent of the trajectory."""
 
+_GUESSED = ("disconnected", "lost")
+"""Tracking statuses of poses that were not measured relative to the map."""
+
 _GAP_FACTOR = 10
 """A curve is interrupted where two stamps are farther apart than this multiple of the median interval."""
 
 
-def save_trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory, path: Path, title: str = "") -> None:
+def save_trajectory_figure(
+    groundtruth: Trajectory | None, estimate: Trajectory, path: Path, title: str = "", statuses: Sequence[str] = ()
+) -> None:
     """Write a figure of a trajectory to a file, see `draw_trajectory`.
 
     Args:
@@ -42,23 +48,28 @@ def save_trajectory_figure(groundtruth: Trajectory | None, estimate: Trajectory,
         estimate: Estimated poses, any number.
         path: Image file; the suffix (.png, .pdf, .svg) selects the format.
         title: Title of the figure.
+        statuses: Tracking status of each pose of the estimate; empty if it is not known.
 
     Raises:
         OutputError: If the file cannot be written.
     """
-    save_figure(draw_trajectory(groundtruth, estimate, title), path)
+    save_figure(draw_trajectory(groundtruth, estimate, title, statuses), path)
 
 
-def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title: str = "") -> Figure:
+def draw_trajectory(
+    groundtruth: Trajectory | None, estimate: Trajectory, title: str = "", statuses: Sequence[str] = ()
+) -> Figure:
     """Draw a trajectory as in the paper's figures: ground truth black, estimate blue, their difference red.
 
     The trajectory is projected onto the two axes with the largest extent. The estimate is aligned to the ground truth.
-    Without ground truth at the timestamps of the estimate, the estimate is drawn alone, in its own world frame.
+    Without ground truth at the timestamps of the estimate, the estimate is drawn alone, in its own world frame. Poses
+    that were only guessed, of lost and of disconnected frames, are dotted.
 
     Args:
         groundtruth: Ground-truth poses, or None.
         estimate: Estimated poses, any number.
         title: Title of the figure.
+        statuses: Tracking status of each pose of the estimate; empty if it is not known.
     """
     p_e = estimate.T_wc[:, :3, 3]
     curves: list[tuple[Tensor, Tensor, str, str]] = [(estimate.stamps, p_e, "tab:blue", "estimate")]
@@ -79,8 +90,15 @@ def draw_trajectory(groundtruth: Trajectory | None, estimate: Trajectory, title:
     axes = figure.add_subplot()
     horizontal, vertical = _widest_axes(curves[0][1])
     plane = [horizontal, vertical]
+    guessed = [status for status in _GUESSED if status in statuses]
     for stamps, positions, colour, label in curves:
-        axes.plot(*insert_gaps(stamps, positions[:, plane]).T, color=colour, linewidth=1.2, label=label)
+        points, guesses = positions[:, plane], None
+        if label == "estimate" and guessed:
+            points, guesses = _separate_guesses(points, statuses)
+        axes.plot(*insert_gaps(stamps, points).T, color=colour, linewidth=1.2, label=label)
+        if guesses is not None:
+            label = f"estimate, {' or '.join(guessed)}"
+            axes.plot(*insert_gaps(stamps, guesses).T, ":", color="tab:orange", linewidth=1.5, label=label)
         axes.plot(*positions[:1, plane].numpy().T, "o", color=colour, markeredgecolor="white", zorder=3)
     if len(segments):
         lines = list(segments[:, :, plane].numpy())
@@ -110,6 +128,15 @@ def insert_gaps(stamps: Tensor, points: Tensor) -> NDArray[np.float64]:
     intervals = stamps.diff()
     after = (intervals > _GAP_FACTOR * intervals.median()).nonzero()[:, 0].numpy() + 1
     return np.insert(points.numpy(), after, np.nan, axis=0)
+
+
+def _separate_guesses(points: Tensor, statuses: Sequence[str]) -> tuple[Tensor, Tensor]:
+    """Return the points of measured poses, and those of guessed poses and their neighbours; NaN at the other poses."""
+    is_guess = torch.tensor([status in _GUESSED for status in statuses])
+    touches_guess = is_guess.clone()
+    touches_guess[1:] |= is_guess[:-1]
+    touches_guess[:-1] |= is_guess[1:]
+    return points.masked_fill(is_guess[:, None], torch.nan), points.masked_fill(~touches_guess[:, None], torch.nan)
 
 
 def _widest_axes(positions: Tensor) -> tuple[int, int]:
