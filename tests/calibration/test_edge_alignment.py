@@ -51,6 +51,18 @@ def test_better_values_are_told_from_equal_ones() -> None:
     assert not registered.is_better(found.values, ZERO)
 
 
+def test_values_must_be_better_in_both_halves_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Edges of objects that only some consecutive views show fit by chance."""
+    views, trajectory = make_views(12)
+    alignment = EdgeAlignment(views, trajectory, depth_delay=0.0)
+    for first_half, expected in ((1.05, True), (0.95, False)):
+        score_of_view = torch.tensor(6 * [first_half] + 6 * [3.0])[alignment._view]
+        monkeypatch.setattr(
+            alignment, "_scores", lambda values, better=score_of_view: better if values[0] else torch.ones(len(better))
+        )
+        assert alignment.is_better(torch.tensor([17.0, 0.0, 0.0]), ZERO) == expected
+
+
 def test_camera_at_rest_tells_the_shift_and_no_delay() -> None:
     _, found = align(shift=(12, -8), moving=False)
     torch.testing.assert_close(found.values[:2], torch.tensor([-12.0, 8.0]).double(), rtol=0, atol=1.5)

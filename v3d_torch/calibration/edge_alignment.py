@@ -193,6 +193,7 @@ class EdgeAlignment:
 
         Edges of one object can fit by chance in all views that show it, and edges of one view in all parts of the
         image. Therefore two t-tests must be significant, one with views and one with parts of the image as clusters.
+        Consecutive views show the same objects, so that they are not independent: both halves of the run must agree.
 
         Args:
             values: Values that should be better, as in `Misalignment`.
@@ -201,10 +202,13 @@ class EdgeAlignment:
         score, compared = self._scores(values), self._scores(other)
         if score.sum() < _MIN_RATIO * compared.sum():
             return False
+        gains = score - compared
+        if not bool((torch.bincount(2 * self._view // len(self), weights=gains) > 0).all()):
+            return False
         height, width = self._gradients.shape[2:]
         cell = (self._pixel * _PARTS / torch.tensor([width, height])).long().clamp(0, _PARTS - 1)
         clusters = self._view, cell[:, 1] * _PARTS + cell[:, 0]
-        return all(_t_statistic(score - compared, cluster) > _MIN_T for cluster in clusters)
+        return all(_t_statistic(gains, cluster) > _MIN_T for cluster in clusters)
 
     def _scores(self, values: Tensor) -> Tensor:
         """Normalised gradient at each boundary moved by the values, (E,)."""
