@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import save_figure
-from v3d_torch.viz.fonts import _characters, _families, drawable_text
+from v3d_torch.viz.fonts import _characters, _families, draw_title, drawable_text
 from v3d_torch.viz.objects_figure import draw_objects
 from v3d_torch.viz.occupancy_figure import draw_occupancy
 from v3d_torch.viz.trajectory_figure import draw_trajectory
@@ -60,3 +60,10 @@ def test_characters_of_another_font_are_drawn_with_it(monkeypatch: pytest.Monkey
 
 def test_fonts_of_boxes_are_not_used() -> None:
     assert _families() and not any(name.startswith("Last Resort") for name in _families())
+
+
+def test_middle_of_a_long_title_is_left_out() -> None:
+    axes = Figure().add_subplot()
+    draw_title(axes.set_title, "beginning_" + 100 * "x" + "_end")
+    title = axes.get_title()
+    assert len(title) <= 51 and title.startswith("beginning_") and title.endswith("_end")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,11 @@ import torch
 from helpers.pictures import count_pixels, read_picture
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from skimage.color import rgb2lab
 
+from v3d_torch.viz.label_placement import separate_labels
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS, draw_objects, save_mask_figure
+from v3d_torch.viz.pose_timelines import STATUS_COLOURS
 
 
 def frames(number: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
@@ -92,3 +96,50 @@ def test_labels_of_moving_objects_are_drawn_over_those_of_static_objects() -> No
         axes, torch.zeros(3, 12, 16, dtype=torch.uint8), [(mask, label, state) for label, state in states.items()]
     )
     assert [text.get_text() for text in axes.texts] == ["b", "d", "a", "c"]  # later labels cover earlier ones
+
+
+# Simulated colour vision, linear RGB (Machado et al., TVCG 2009, severity 1)
+VISION = {
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.3039]],
+}
+
+
+@pytest.mark.parametrize("vision", [np.eye(3), *map(np.array, VISION.values())], ids=["normal", *VISION])
+@pytest.mark.parametrize("colours", [MOTION_STATE_COLOURS, STATUS_COLOURS], ids=["motion states", "statuses"])
+def test_colours_can_be_told_apart_by_colour_blind_people(colours: dict[str, str], vision: np.ndarray) -> None:
+    seen = []
+    for colour in colours.values():
+        rgb = np.array(to_rgb(colour))
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        linear = np.clip(vision @ linear, 0, 1)
+        rgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+        seen.append(rgb2lab(rgb.reshape(1, 1, 3)).ravel())
+    assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 20
+
+
+def test_labels_at_the_same_place_do_not_cover_each_other() -> None:
+    figure = Figure(figsize=(6, 4.5))
+    axes = figure.add_subplot()
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[20:25, 58:64] = True
+    objects = [(mask, f"dining table {number}", "static") for number in range(4)]
+    draw_objects(axes, torch.zeros(3, 48, 64, dtype=torch.uint8), objects)
+    separate_labels(figure, axes)
+    figure.draw_without_rendering()  # moves the boxes to the labels
+    patches = [text.get_bbox_patch() for text in axes.texts]
+    boxes = [patch.get_window_extent() for patch in patches if patch is not None]
+    assert len(boxes) == 4
+    assert not any(a.overlaps(b.shrunk(0.99, 0.99)) for a, b in combinations(boxes, 2))
+    assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 + 1 for box in boxes)
+
+
+def test_label_without_a_place_is_hidden() -> None:
+    figure = Figure(figsize=(2, 1))
+    axes = figure.add_subplot()
+    for number in range(30):
+        axes.annotate(f"name {number}", (0.5, 0.5))
+    separate_labels(figure, axes)
+    shown = [text for text in axes.texts if text.get_visible()]
+    assert 1 <= len(shown) < 10

@@ -6,6 +6,7 @@ from itertools import combinations
 
 import torch
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
@@ -67,7 +68,18 @@ def test_names_of_objects_at_the_same_place_do_not_overlap() -> None:
 
 
 def test_objects_of_few_frames_are_not_drawn() -> None:
-    assert draw(table_of((1, MotionState.STATIC), frames=4)) == []
+    table = table_of((1, MotionState.STATIC), frames=4)
+    assert draw(table) == []
+    assert draw_axes(table).get_xlabel() == "x [m]\nnot drawn: 1 that were seen in fewer than 5 frames"
+
+
+def test_path_has_gap_where_the_object_was_not_seen() -> None:
+    table, away = table_of((1, MotionState.DYNAMIC)), object_at(3.0, 1, 4.0, MotionState.DYNAMIC)
+    for index in (30, 31):
+        frame = RGBDFrame(index, index / 10, torch.zeros(3, 2, 2, dtype=torch.uint8), torch.ones(1, 2, 2))
+        table.append_objects(frame, FrameObjects([away], MASK, MASK, []), UP)
+    (path,) = [each for each in draw_axes(table).collections if isinstance(each, LineCollection)]
+    assert len(path.get_segments()) == 8  # between ten places, without that from frame 7 to 30
 
 
 def test_only_the_most_important_of_many_objects_have_a_name() -> None:

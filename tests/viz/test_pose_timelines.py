@@ -12,6 +12,7 @@ from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import embed_svg
 from v3d_torch.viz.pose_timelines import draw_errors, draw_masked_fraction, draw_positions, draw_statuses
+from v3d_torch.viz.time_axes import frame_cells
 
 
 def test_errors_equal_distances_after_alignment() -> None:
@@ -81,3 +82,17 @@ def test_one_or_two_frames_are_drawn(frames: int) -> None:
         "statuses": draw_statuses(estimate.stamps, ["tracked"] * frames, estimate.stamps[:1]),
     }.items():
         assert embed_svg(figure, name).startswith("<svg")
+
+
+def test_cells_of_frames_leave_gaps_empty() -> None:
+    """Frames at 0, 1, 2, 10 and 11 s: the cells of the frames beside the gap end after a second."""
+    edges, cells = frame_cells([0, 1, 2, 10, 11], np.array([[1.0, 2, 3, 4, 5]]))
+    assert edges.tolist() == [-0.5, 0.5, 1.5, 3, 9, 10.5, 11.5]
+    np.testing.assert_array_equal(cells, [[1, 2, 3, np.nan, 4, 5]])
+
+
+def test_cells_of_regular_frames_touch() -> None:
+    edges, cells = frame_cells([0.0], np.array([[7.0]]))
+    assert edges.tolist() == [-0.5, 0.5] and cells.tolist() == [[7.0]]
+    edges, cells = frame_cells([0, 2, 4], np.array([[1.0, 2, 3]]))
+    assert edges.tolist() == [-1, 1, 3, 5] and cells.tolist() == [[1, 2, 3]]

@@ -13,7 +13,7 @@ from helpers.trajectories import arc, shaken
 
 from v3d_torch.errors import OutputError
 from v3d_torch.types import Trajectory
-from v3d_torch.viz.trajectory_figure import save_trajectory_figure
+from v3d_torch.viz.trajectory_figure import draw_trajectory, save_trajectory_figure, within
 
 BLACK, BLUE = "black", "tab:blue"
 
@@ -105,3 +105,13 @@ def test_unwritable_figure_is_an_error_and_leaves_no_file(tmp_path: Path) -> Non
     with pytest.raises(OutputError, match=r"figure\.png"):
         save_trajectory_figure(None, arc(), tmp_path / "figure.png")
     assert [path.name for path in tmp_path.iterdir()] == ["figure.png"]
+
+
+def test_ground_truth_is_drawn_during_the_estimate_only() -> None:
+    """Ground truth is often recorded for longer than the images."""
+    truth = arc()
+    part = Trajectory(truth.stamps[20:40], truth.T_wc[20:40])
+    inside = within(truth, part)
+    assert torch.equal(inside.stamps, part.stamps) and torch.equal(inside.T_wc, part.T_wc)
+    curve = draw_trajectory(truth, part).axes[0].lines[0]
+    assert curve.get_label() == "ground truth" and len(np.asarray(curve.get_xdata())) == 20

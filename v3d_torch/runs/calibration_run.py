@@ -119,7 +119,7 @@ def calibration_table(calibration: Calibration) -> Table:
     """Return a table of all parameters: given value, estimate, standard deviation, and result."""
     table = Table(title="camera")
     for column in ("parameter", "given", "estimated", "+-", "result"):
-        table.add_column(column, justify="left" if column in ("parameter", "result") else "right")
+        table.add_column(column, justify="left" if column in ("parameter", "result") else "right", overflow="fold")
     for each in calibration.estimates:
         given = "unknown" if each.given is None else f"{each.given:.6g}"
         told = math.isfinite(each.sigma) and math.isfinite(each.value)

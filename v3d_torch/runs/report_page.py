@@ -27,9 +27,11 @@ from v3d_torch.viz.trajectory_figure import draw_trajectory
 _FIGURES = {
     "masks.png": "Frames with the mask of each object in the colour of its motion state.",
     "voting.png": "Frame with the most votes for dynamic objects: a line connects two objects, one of which voted for"
-    " the other.",
-    "clusters.png": "Point clouds of the objects in the frame with the most votes, before and after outlier rejection.",
-    "objects.png": "The room from above: path and last box of each object in the colour of its motion state, with an"
+    " the other over some time span. The number of an object is that of the time span with the most votes, plus one if"
+    " the free-space check agrees.",
+    "clusters.png": "Point clouds of the objects in the frame with the most votes for dynamic objects, or with the most"
+    " objects if there are no votes, before and after outlier rejection.",
+    "objects.png": "The room from above: path and last box of the objects in the colour of their motion state, with an"
     " arrow to where a dynamic object would be a second later.",
     "occupancy.png": "Occupancy map from above: free and occupied floor, and the distance to obstacles.",
 }

@@ -11,6 +11,9 @@ from matplotlib.text import Text
 _REPLACEMENT = "?"
 """Replacement for characters that no installed font has, instead of an empty box."""
 
+_MAX_TITLE = 50
+"""Maximum number of characters of a title, so that it fits into the figure; the middle of a longer one is left out."""
+
 _PLACEHOLDERS = "Last Resort"
 """Beginning of the names of fonts that have a box for every character."""
 
@@ -22,6 +25,8 @@ def draw_title(set_title: Callable[..., Text], title: str) -> None:
         set_title: `Axes.set_title` or `Figure.suptitle`.
         title: Title.
     """
+    if len(title) > _MAX_TITLE:
+        title = f"{title[: _MAX_TITLE // 2]}…{title[-_MAX_TITLE // 2 :]}"
     text, fonts = drawable_text(title)
     set_title(text, parse_math=False, fontfamily=fonts)
 

@@ -17,6 +17,7 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from v3d_torch.viz.figure_output import save_figure
+from v3d_torch.viz.label_placement import separate_labels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,12 +26,12 @@ Overlay = tuple[Tensor, str, str]
 """Mask (bool, H x W), label such as "person 3", and motion state such as "dynamic"."""
 
 MOTION_STATE_COLOURS = {
-    "static": "#2ca02c",
-    "dynamic": "#d62728",
-    "deforming": "#ff7f0e",
-    "unknown": "#7f7f7f",
+    "static": "#1b6fb3",
+    "dynamic": "#d1341b",
+    "deforming": "#f2a900",
+    "unknown": "#909090",
 }
-"""Colour of each motion state. Any other state is drawn as unknown."""
+"""Colour of each motion state, which colour-blind people can tell apart, too. Any other state is drawn as unknown."""
 
 _MAX_FRAMES = 6
 _COLUMNS = 3
@@ -68,10 +69,13 @@ def save_mask_figure(images: Sequence[Tensor], overlays: Sequence[Sequence[Overl
         axes.axis("off")
     for axes, (image, objects) in zip(grid, frames, strict=False):
         draw_objects(axes, image, objects)
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     present = {parse_motion_state(motion_state) for _, objects in frames for _, _, motion_state in objects}
     handles = [Patch(color=colour, label=name) for name, colour in MOTION_STATE_COLOURS.items() if name in present]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    for axes in grid:
+        separate_labels(figure, axes)
     save_figure(figure, path)
 
 
@@ -118,7 +122,7 @@ def _draw_label(axes: Axes, size: Sequence[int], position: tuple[float, float], 
             {"left": 0.02 * width, "right": 0.98 * width, "center": x}[side],
             min(max(y, 0.04 * height), 0.96 * height),
         ),
-        color="white",
+        color="black" if colour == MOTION_STATE_COLOURS["deforming"] else "white",
         fontsize=8,
         ha=side,
         va="center",

@@ -15,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS, parse_motion_state
-from v3d_torch.viz.time_axes import cell_edges, make_time_axes
+from v3d_torch.viz.time_axes import frame_cells, make_time_axes
 
 _MAX_OBJECTS = 20  # rows that fit on a page
 _ROW_HEIGHT = 0.17  # inches
@@ -68,17 +68,17 @@ def draw_object_timelines(
     chamfer = _grid(stamps, ids, table, lambda row: row.chamfer)
     voted = [i for i, row in enumerate(votes) if np.nanmax(row, initial=0) > 0]
     measured = [i for i, row in enumerate(chamfer) if np.isfinite(row).any()]
-    panels: list[tuple[list[int], Callable[[Axes, NDArray[np.float64]], None]]] = [
-        (list(range(len(ids))), lambda axes, edges: _draw_motion_states(axes, edges, motion_state)),
-        (voted, lambda axes, edges: _draw_votes(axes, edges, votes[voted])),
-        (measured, lambda axes, edges: _draw_chamfer(axes, edges, chamfer[measured], chamfer_threshold)),
+    panels: list[tuple[list[int], Callable[[Axes, Sequence[float]], None]]] = [
+        (list(range(len(ids))), lambda axes, times: _draw_motion_states(axes, times, motion_state)),
+        (voted, lambda axes, times: _draw_votes(axes, times, votes[voted])),
+        (measured, lambda axes, times: _draw_chamfer(axes, times, chamfer[measured], chamfer_threshold)),
     ]
     panels = [(rows, draw) for rows, draw in panels if rows]
     seconds = [stamp - stamps[0] for stamp in stamps]
     heights = [max(_MIN_ROWS, len(rows)) * _ROW_HEIGHT for rows, _ in panels]
     figure, all_axes = make_time_axes(seconds, heights, extra_height=0.3)
     for axes, (rows, draw) in zip(all_axes, panels, strict=True):
-        draw(axes, cell_edges(seconds))
+        draw(axes, seconds)
         axes.set_ylim(len(rows), 0)
         axes.set_yticks(np.arange(len(rows)) + 0.5, [labels[ids[i]] for i in rows], fontsize="x-small")
         axes.grid(False)
@@ -112,32 +112,35 @@ def _grid(
     return grid
 
 
-def _draw_motion_states(axes: Axes, edges: NDArray[np.float64], grid: NDArray[np.float64]) -> None:
+def _draw_motion_states(axes: Axes, seconds: Sequence[float], grid: NDArray[np.float64]) -> None:
     colours = ListedColormap(list(MOTION_STATE_COLOURS.values()))
     vmax = len(MOTION_STATE_COLOURS) - 0.5
-    axes.pcolormesh(edges, np.arange(len(grid) + 1), grid, cmap=colours, vmin=-0.5, vmax=vmax, rasterized=True)
+    edges, cells = frame_cells(seconds, grid)
+    axes.pcolormesh(edges, np.arange(len(grid) + 1), cells, cmap=colours, vmin=-0.5, vmax=vmax, rasterized=True)
     axes.set_title("motion state", loc="left", fontsize="small")
 
 
-def _draw_votes(axes: Axes, edges: NDArray[np.float64], grid: NDArray[np.float64]) -> None:
-    _draw_scale(axes, edges, grid, vmin=0.5, vmax=float(np.nanmax(grid)), integer=True)  # no votes: below the scale
-    axes.set_title("votes", loc="left", fontsize="small")
+def _draw_votes(axes: Axes, seconds: Sequence[float], grid: NDArray[np.float64]) -> None:
+    _draw_scale(axes, seconds, grid, vmin=0.5, vmax=float(np.nanmax(grid)), integer=True)  # no votes: below the scale
+    axes.set_title("votes (grey: none)", loc="left", fontsize="small")
 
 
 def _draw_chamfer(
-    axes: Axes, edges: NDArray[np.float64], grid: NDArray[np.float64], chamfer_threshold: float | None
+    axes: Axes, seconds: Sequence[float], grid: NDArray[np.float64], chamfer_threshold: float | None
 ) -> None:
     vmax = float(np.nanquantile(grid, _CHAMFER_QUANTILE))
-    _draw_scale(axes, edges, grid, vmin=0.0, vmax=vmax, integer=False)
-    threshold = f"; deforming above {chamfer_threshold:g} m" if chamfer_threshold is not None else ""
-    title = f"Chamfer distance to the object's earlier cloud [m]{threshold}"
+    _draw_scale(axes, seconds, grid, vmin=0.0, vmax=vmax, integer=False)
+    title = "Chamfer distance to the object's earlier cloud [m]"
+    if chamfer_threshold is not None:
+        title += f"; threshold {chamfer_threshold:g} m, and the free-space check has to agree"
     axes.set_title(title, loc="left", fontsize="small")
 
 
 def _draw_scale(
-    axes: Axes, edges: NDArray[np.float64], grid: NDArray[np.float64], *, vmin: float, vmax: float, integer: bool
+    axes: Axes, seconds: Sequence[float], grid: NDArray[np.float64], *, vmin: float, vmax: float, integer: bool
 ) -> None:
     """Draw a grid with a colour scale; values below the scale are pale."""
     colours = colormaps["viridis"].with_extremes(under=(0.5, 0.5, 0.5, 0.2))
-    mesh = axes.pcolormesh(edges, np.arange(len(grid) + 1), grid, cmap=colours, vmin=vmin, vmax=vmax, rasterized=True)
+    edges, cells = frame_cells(seconds, grid)
+    mesh = axes.pcolormesh(edges, np.arange(len(grid) + 1), cells, cmap=colours, vmin=vmin, vmax=vmax, rasterized=True)
     axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=12, ticks=MaxNLocator(4, integer=integer))

@@ -9,7 +9,6 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -19,6 +18,7 @@ from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.fonts import draw_title
+from v3d_torch.viz.label_placement import separate_labels
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 
 if TYPE_CHECKING:
@@ -29,6 +29,9 @@ _MAX_POINTS = 60_000
 
 _MIN_FRAMES = 5
 """Objects of fewer frames are not drawn: most are false detections."""
+
+_MAX_GAP = 5
+"""Number of frames between two places of an object above which its path between them is not drawn."""
 
 _MAX_NAMES = 50
 """Number of objects with a name: more names hide the figure, and the time to separate them increases with the square of
@@ -60,27 +63,31 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     x, y, _ = background.T.numpy()
     axes.scatter(x, y, s=0.3, color="#c8c8c8", linewidths=0, rasterized=True)
     x, y, _ = (trajectory.T_wc[:, :3, 3] @ R_lw.T).T.numpy()
-    axes.plot(x, y, color="tab:blue", linewidth=1.2, label="camera path")
-    rows = _rows_of_objects(objects)
+    axes.plot(x, y, color="black", linewidth=1.2, label="camera path")
+    rows, omitted = _rows_of_objects(objects)
     named = set(_select_names(objects, rows))
     for number in rows:
         _draw_object(axes, objects, rows[number], R_lw, with_name=number in named)
+    drawn = {_STATES[code].value for own in rows.values() for code in objects["motion_state"][own].tolist()}
     for state, colour in MOTION_STATE_COLOURS.items():
-        axes.plot([], [], color=colour, label=state)
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        if state in drawn:
+            axes.plot([], [], color=colour, label=state)
+    note = f"\nnot drawn: {omitted} that were seen in fewer than {_MIN_FRAMES} frames" if omitted else ""
+    axes.set(xlabel=f"x [m]{note}", ylabel="y [m]", aspect="equal")
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     draw_title(axes.set_title, title)
-    _separate_names(figure, axes)
+    separate_labels(figure, axes)
     return figure
 
 
-def _rows_of_objects(objects: ObjectTable) -> dict[int, Tensor]:
-    """Return the rows of each object that is drawn, in the order of the frames, by id."""
+def _rows_of_objects(objects: ObjectTable) -> tuple[dict[int, Tensor], int]:
+    """Return the rows of each object that is drawn, in the order of the frames, by id; and the number of the others."""
     order = objects["id"].argsort(stable=True)
     ids, counts = objects["id"][order].unique_consecutive(return_counts=True)
     rows = dict(zip(ids.tolist(), order.split(counts.tolist()), strict=True))
-    return {number: own for number, own in rows.items() if len(own) >= _MIN_FRAMES}
+    drawn = {number: own for number, own in rows.items() if len(own) >= _MIN_FRAMES}
+    return drawn, len(rows) - len(drawn)
 
 
 def _select_names(objects: ObjectTable, rows: dict[int, Tensor]) -> list[int]:
@@ -90,26 +97,13 @@ def _select_names(objects: ObjectTable, rows: dict[int, Tensor]) -> list[int]:
     return sorted(rows, key=rank.__getitem__)[:_MAX_NAMES]
 
 
-def _separate_names(figure: Figure, axes: Axes) -> None:
-    """Move names into the axes, and down until none overlaps another."""
-    figure.draw_without_rendering()  # determines the size of the axes and of the texts
-    names, boxes = [text for text in axes.texts if text.get_text()], list[Bbox]()
-    for name in sorted(names, key=lambda text: text.get_window_extent().y0, reverse=True):
-        box = name.get_window_extent()
-        box = box.translated(min(axes.bbox.x1 - box.x1, 0.0), 0.0)
-        while any(box.overlaps(other) for other in boxes):
-            box = box.translated(0.0, -box.height)
-        boxes.append(box)
-        x, y = axes.transData.inverted().transform((box.x0, box.y0))
-        name.set_position((x, y))
-
-
 def _draw_object(axes: Axes, objects: ObjectTable, rows: Tensor, R_lw: Tensor, *, with_name: bool) -> None:
     """Draw path, last box and velocity of the object of some rows."""
     centroid = (objects["centroid"][rows] @ R_lw.T)[:, :2].numpy()
     colours = [MOTION_STATE_COLOURS[_STATES[code].value] for code in objects["motion_state"][rows].tolist()]
-    segments = np.stack([centroid[:-1], centroid[1:]], axis=1)
-    axes.add_collection(LineCollection(list(segments), colors=colours[1:], linewidths=1.5))
+    seen = (objects["frame"][rows].diff() <= _MAX_GAP).nonzero()[:, 0].tolist()
+    segments = [centroid[first : first + 2] for first in seen]
+    axes.add_collection(LineCollection(segments, colors=[colours[first + 1] for first in seen], linewidths=1.5))
     box = objects["box"][rows]
     known = box[:, 0].isfinite().nonzero()[:, 0]
     if not len(known):

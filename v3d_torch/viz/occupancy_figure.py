@@ -71,7 +71,8 @@ def draw_occupancy(
         axes.set_facecolor(STATE_COLOURS[VoxelState.UNKNOWN])
         (left, lower), (right, upper) = low.tolist(), high.tolist()
         axes.set(xlim=(left, right), ylim=(lower, upper), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-    for state in VoxelState:
+    # Without a floor, free space is coloured by the distance to obstacles.
+    for state in [each for each in VoxelState if floor is not None or each is not VoxelState.FREE]:
         colour = STATE_COLOURS[state]
         panels[0].plot([], [], "s", color=colour, markeredgecolor="gray", label=state.name.lower())
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)

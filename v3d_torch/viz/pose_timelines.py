@@ -17,11 +17,11 @@ from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors
 from v3d_torch.evaluation.rpe import motion_errors
 from v3d_torch.types import Trajectory
-from v3d_torch.viz.time_axes import cell_edges, make_time_axes
-from v3d_torch.viz.trajectory_figure import insert_gaps
+from v3d_torch.viz.time_axes import frame_cells, make_time_axes
+from v3d_torch.viz.trajectory_figure import insert_gaps, within
 
-STATUS_COLOURS = {"tracked": "#2ca02c", "odometry": "#1f77b4", "disconnected": "#ff7f0e", "lost": "#d62728"}
-"""Colour of each tracking status."""
+STATUS_COLOURS = {"tracked": "#1b6fb3", "odometry": "#7ab8d9", "disconnected": "#f2a900", "lost": "#d1341b"}
+"""Colour of each tracking status, which colour-blind people can tell apart, too."""
 
 
 def draw_positions(groundtruth: Trajectory | None, estimate: Trajectory, evaluation: Evaluation | None) -> Figure:
@@ -38,7 +38,8 @@ def draw_positions(groundtruth: Trajectory | None, estimate: Trajectory, evaluat
     if evaluation is not None and groundtruth is not None:
         T_ge = evaluation.alignment.T_ge
         positions = positions @ T_ge[:3, :3].mT + T_ge[:3, 3]
-        _plot_positions(panels, groundtruth.stamps - start, groundtruth.T_wc[:, :3, 3], "black", "ground truth")
+        truth = within(groundtruth, estimate)
+        _plot_positions(panels, truth.stamps - start, truth.T_wc[:, :3, 3], "black", "ground truth")
     _plot_positions(panels, estimate.stamps - start, positions, "tab:blue", "estimate")
     for axes, name in zip(panels, "xyz", strict=True):
         axes.set_ylabel(f"{name} [m]")
@@ -98,7 +99,8 @@ def draw_statuses(stamps: Tensor, statuses: Sequence[str], keyframes: Tensor) ->
     names = list(STATUS_COLOURS)
     row = np.array([[float(names.index(status)) for status in statuses]])
     colours = ListedColormap(list(STATUS_COLOURS.values()))
-    edges, vmax = cell_edges(seconds), len(names) - 0.5
+    vmax = len(names) - 0.5
+    edges, row = frame_cells(seconds, row)
     axes.pcolormesh(edges, [0.35, 1.0], row, cmap=colours, vmin=-0.5, vmax=vmax, rasterized=True)
     (marks,) = axes.plot(keyframes - stamps[0], np.full(len(keyframes), 0.15), "|", color="black")
     marks.set_label(f"{len(keyframes)} keyframes")

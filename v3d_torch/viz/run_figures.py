@@ -51,12 +51,12 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
         save_figure(draw_occupancy(mapper.map, trajectory, up, floor, sequence.name), folder / "occupancy.png")
     snapshot = record.most_dynamic_snapshot
     if snapshot is not None and snapshot.result.vote_pairs:
-        _draw_votes(folder / "voting.png", pipeline, snapshot)
+        _draw_votes(folder / "voting.png", pipeline, snapshot, _title(snapshot, trajectory))
     if snapshot is not None and (clusters := _clusters(pipeline, snapshot)):
-        save_clusters_figure(clusters, folder / "clusters.png", _title(snapshot))
+        save_clusters_figure(clusters, folder / "clusters.png", _title(snapshot, trajectory))
 
 
-def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot) -> None:
+def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot, title: str) -> None:
     camera, T_cw = pipeline.sequence.camera, snapshot.T_cw
     objects: dict[int, Overlay] = {}
     centres: dict[int, Tensor] = {}
@@ -67,7 +67,7 @@ def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot) -> None:
         centroid = T_cw[:3, :3] @ obj.centroid + T_cw[:3, 3]
         if mask.any() and centroid[2] > 0:  # in view and in front of the camera; false for NaN, an unknown centroid
             centres[obj.id] = camera.distort(camera.project(centroid[None]))[0]
-    save_voting_figure(snapshot.frame.image, objects, centres, snapshot.result.vote_pairs, path, _title(snapshot))
+    save_voting_figure(snapshot.frame.image, objects, centres, snapshot.result.vote_pairs, path, title)
 
 
 def _clusters(pipeline: Pipeline, snapshot: Snapshot) -> list[Cluster]:
@@ -98,5 +98,6 @@ def _overlay(obj: TrackedObject) -> Overlay:
     return obj.mask, obj.name, obj.motion_state.value
 
 
-def _title(snapshot: Snapshot) -> str:
-    return f"frame {snapshot.frame.index} at {snapshot.frame.stamp:.3f} s"
+def _title(snapshot: Snapshot, trajectory: Trajectory) -> str:
+    seconds = snapshot.frame.stamp - float(trajectory.stamps[0])
+    return f"frame {snapshot.frame.index}, {seconds:.3f} s after the first frame"

@@ -35,10 +35,23 @@ def make_time_axes(
     return figure, list(panels)
 
 
-def cell_edges(seconds: Sequence[float]) -> NDArray[np.float64]:
-    """Return the edges of one cell per frame: times halfway between frames, shape (frames + 1,)."""
-    if len(seconds) == 1:
-        return np.array([seconds[0] - 0.5, seconds[0] + 0.5])
-    times = np.asarray(seconds)
+def frame_cells(seconds: Sequence[float], grid: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Arrange the values of frames as cells for `Axes.pcolormesh`. Times without frames are empty.
+
+    A cell ends halfway to the next frame, or one median interval after its frame if that is sooner.
+
+    Args:
+        seconds: Time of each frame, increasing.
+        grid: Values, one column per frame, shape (rows, frames).
+
+    Returns:
+        Edges of the columns, shape (columns + 1,), and values with NaN columns at gaps, shape (rows, columns).
+    """
+    times = np.asarray(seconds, np.float64)
+    step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     middles = (times[1:] + times[:-1]) / 2
-    return np.concatenate([[2 * times[0] - middles[0]], middles, [2 * times[-1] - middles[-1]]])
+    starts = np.concatenate([[times[0] - step / 2], np.maximum(middles, times[1:] - step)])
+    ends = np.concatenate([np.minimum(middles, times[:-1] + step), [times[-1] + step / 2]])
+    before_gap = np.nonzero(ends[:-1] < starts[1:])[0]
+    edges = np.insert(np.append(starts, ends[-1]), before_gap + 1, ends[before_gap])
+    return edges, np.insert(grid, before_gap + 1, np.nan, axis=1)

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from v3d_torch.evaluation.association import associate_trajectories
+from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
 from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.evaluation.statistics import Statistics
@@ -78,11 +78,12 @@ def draw_trajectory(
     if groundtruth is not None and matches:
         T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
         alignment = align(T_gc, T_ec, oriented=has_orientations(groundtruth))
+        truth = within(groundtruth, estimate)
         aligned = p_e @ alignment.T_ge[:3, :3].mT + alignment.T_ge[:3, 3]
         segments = torch.stack([T_gc[:, :3, 3], aligned[matches.estimate]], dim=1)
         error = Statistics.of(absolute_errors(T_gc, T_ec, alignment)).rmse
         curves = [
-            (groundtruth.stamps, groundtruth.T_wc[:, :3, 3], "black", "ground truth"),
+            (truth.stamps, truth.T_wc[:, :3, 3], "black", "ground truth"),
             (estimate.stamps, aligned, "tab:blue", "estimate"),
         ]
     figure = Figure(figsize=(6.4, 6.0), dpi=150, layout="constrained")
@@ -111,6 +112,13 @@ def draw_trajectory(
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
+
+
+def within(groundtruth: Trajectory, estimate: Trajectory) -> Trajectory:
+    """Return the part of a ground truth during an estimate: recordings of ground truth are often longer."""
+    first, last = estimate.stamps[0] - MAX_TIME_DIFFERENCE, estimate.stamps[-1] + MAX_TIME_DIFFERENCE
+    rows = (groundtruth.stamps >= first) & (groundtruth.stamps <= last)
+    return Trajectory(groundtruth.stamps[rows], groundtruth.T_wc[rows])
 
 
 def insert_gaps(stamps: Tensor, points: Tensor) -> NDArray[np.float64]:
