@@ -144,6 +144,38 @@ def test_folder_that_others_can_write_is_not_used(tmp_path: Path) -> None:
     assert compiler._make_private(tmp_path / "other" / "kernels")
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")
+def test_folder_that_others_can_replace_is_not_used(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    folder = shared / "mine" / "kernels" / "version"
+    shared.chmod(0o777)
+    assert compiler._make_private(folder) is None
+    shared.chmod(0o1777)  # as a temporary folder, in which only the owner can rename a file
+    assert compiler._make_private(folder) == folder
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can make files of other users")
+def test_folder_below_that_of_another_user_is_not_used(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    folder = other / "kernels" / "version"
+    assert compiler._make_private(folder) == folder
+    os.chown(other, 65534, 65534)
+    assert compiler._make_private(folder) is None
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links on Windows need special permissions")
+def test_folder_behind_a_link_is_used_without_the_link(tmp_path: Path) -> None:
+    """Another user can change a link after the check."""
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    assert compiler._make_private(link / "kernels" / "version") == tmp_path / "kernels" / "version"
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    assert compiler._make_private(loop / "kernels") is None
+
+
 def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest.MonkeyPatch) -> None:
     class Helper:
         killed = False

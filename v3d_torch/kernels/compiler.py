@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
+import stat
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -228,25 +229,46 @@ def _code_folder() -> Path:
     files = sorted(Path(__file__).parent.glob("*.py"))
     version = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:16]
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folder = (Path(chosen) if chosen else cache_dir() / "kernels") / version
-    if _make_private(folder):
-        return folder
-    # Without a cache folder, as in a container with a read-only home, use the system's temporary folder. A container's
-    # user may have no name, and Windows has a temporary folder for each user.
-    owner = f"v3d_torch-{os.getuid()}" if hasattr(os, "getuid") else "v3d_torch"
-    folder = Path(tempfile.gettempdir()) / owner / "kernels" / version
-    return folder if _make_private(folder) else Path(tempfile.mkdtemp(prefix="v3d_torch-"))
+    folder = _make_private((Path(chosen) if chosen else cache_dir() / "kernels") / version)
+    if folder is None:
+        # Without a cache folder, as in a container with a read-only home, use the system's temporary folder. A
+        # container's user may have no name, and Windows has a temporary folder for each user.
+        owner = f"v3d_torch-{os.getuid()}" if hasattr(os, "getuid") else "v3d_torch"
+        folder = _make_private(Path(tempfile.gettempdir()) / owner / version)
+    return folder or Path(tempfile.mkdtemp(prefix="v3d_torch-"))
 
 
-def _make_private(folder: Path) -> bool:
-    """Make a folder that only this user can write; return False if it cannot be made or belongs to another user.
+def _make_private(folder: Path) -> Path | None:
+    """Make a folder, and the one above it, that only this user can write; return its path without symbolic links.
 
-    Compiled code in the folder runs with the rights of this user, so nobody else may write it.
+    Compiled code in the folder runs with the rights of this user, so nobody else may write it, or replace a folder
+    above it by another one.
+
+    Returns:
+        The path; None if the folder cannot be made, or if another user can write or replace it.
     """
+    folder = Path(os.path.realpath(folder))  # another user can change where a link leads
     try:
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        status = folder.stat()
+        folder.parent.parent.mkdir(parents=True, exist_ok=True)
+        for each in (folder.parent, folder):
+            each.mkdir(mode=0o700, exist_ok=True)
+        if hasattr(os, "getuid"):
+            status = folder.lstat()
+            is_own = status.st_uid == os.getuid() and not status.st_mode & 0o022
+            if not is_own or any(map(_is_replaceable, folder.parents)):
+                return None
     except OSError:
-        return False
-    is_own = not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & 0o022)
-    return is_own and os.access(folder, os.W_OK)
+        return None
+    return folder if os.access(folder, os.W_OK) else None
+
+
+def _is_replaceable(folder: Path) -> bool:
+    """Check whether another user than root can rename the folders in a folder."""
+    status = folder.lstat()
+    # The owner of the root folder is root, also where a container shows root under another id.
+    if status.st_uid not in (0, os.getuid(), Path(folder.anchor).lstat().st_uid):
+        return True
+    # Many systems give each user a group with the same id, which has no other members, and let it write by default.
+    has_own_group = status.st_gid == os.getgid() == os.getuid()
+    is_writable = status.st_mode & (0o002 if has_own_group else 0o022)
+    return bool(is_writable) and not status.st_mode & stat.S_ISVTX
