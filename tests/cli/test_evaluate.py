@@ -107,6 +107,18 @@ def test_bad_input_is_one_line_and_exit_code_2(case: str, files: tuple[str, str]
     assert result.stderr.startswith("error: ") and "bad.txt" in result.stderr and result.stderr.count("\n") == 1
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a device that is always full")
+@pytest.mark.parametrize("options", [(), ("--json",)])
+def test_output_that_cannot_be_written_is_one_line_and_exit_code_2(
+    options: tuple[str, ...], files: tuple[str, str]
+) -> None:
+    command = [sys.executable, "-m", "v3d_torch", "evaluate", *files, *options]
+    with Path("/dev/full").open("w") as output:
+        done = subprocess.run(command, stdout=output, stderr=subprocess.PIPE, text=True)  # noqa: S603
+    reason = "reading or writing failed (No space left on device); check the disk, and where the output goes"
+    assert (done.returncode, done.stderr) == (2, f"error: {reason}\n")
+
+
 def test_defaults_of_command_equal_those_of_function() -> None:
     command, function = (inspect.signature(f).parameters for f in (main, evaluate))
     assert command["max_difference"].default == function["max_time_difference"].default

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from v3d_torch.datasets import PAPER_SEQUENCES, short_name
-from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.outcome import Outcome, label_sequence
 from v3d_torch.evaluation.paper_tables import load_paper_scores
 from v3d_torch.evaluation.summary import (
     format_csv,
@@ -183,3 +183,7 @@ def test_part_of_a_sequence_is_marked_in_all_tables() -> None:
         console.print(table)
     assert console.export_text().count(f"({PART})") == 3
     assert str(PARTS[0]) == f"fr3/w/xyz, full, seed 0: ATE 0.0010 m ({PART})"
+
+
+def test_name_in_tables_is_one_line_without_control_characters() -> None:
+    assert label_sequence("a\nb\x1b[31m", "part: 3 of 9 frames") == "a\\nb\\x1b[31m (part: 3 of 9 frames)"

@@ -40,6 +40,14 @@ def test_memory_for_large_images_is_stated(width: int, height: int, gigabytes: i
     assert output.getvalue() == ("" if gigabytes is None else expected)
 
 
+def test_control_characters_of_names_do_not_reach_the_terminal() -> None:
+    source: Any = SimpleNamespace(name="a\nb\x1b]0;title\x1b\\[red]", camera=replace(CAMERA, width=7680, height=4320))
+    output = StringIO()
+    print_notes(source, Console(file=output, width=300))
+    assert output.getvalue().startswith("note: a\\nb\\x1b]0;title\\x1b\\[red]: a run with images of 7680x4320 pixels")
+    assert output.getvalue().count("\n") == 1
+
+
 def test_two_sequences_with_the_same_name_are_rejected(tmp_path: Path) -> None:
     first, second = (tmp_path / place / "seq" for place in ("home", "lab"))
     for folder in (first, second):

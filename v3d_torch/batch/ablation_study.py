@@ -30,6 +30,7 @@ from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import folder_name
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.open_sequences import open_sequences
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import make_result_folder
 from v3d_torch.runs.run import Run
@@ -115,7 +116,7 @@ def run_ablation_study(
                 run_folder = make_result_folder(folder / folder_name(name) / variant / f"seed{seed}", name)
                 metrics, failure = _run(sequence, segment, config, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
-                console.print(str(outcomes[-1]), markup=False)
+                print_line(console, str(outcomes[-1]))
                 write_text(folder / "ablation.md", format_markdown(outcomes, _NOTE))
                 write_text(folder / _TABLE, format_csv(outcomes))
             console.print(make_screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
@@ -123,7 +124,7 @@ def run_ablation_study(
         done, total = len(outcomes), len(configs) * len(sequences)
         raise InputError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
     console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
-    console.print(f"results: {folder}", markup=False)
+    print_line(console, f"results: {folder}")
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
         raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
 

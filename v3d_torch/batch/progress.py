@@ -10,6 +10,7 @@ from rich.progress import Progress, TaskID
 
 from v3d_torch.batch.executor import BatchEvent, JobFinished, JobProgress
 from v3d_torch.batch.job import Job
+from v3d_torch.io.text import printable
 
 
 class BatchProgress:
@@ -34,7 +35,7 @@ class BatchProgress:
         job = event.job
         if isinstance(event, JobProgress):
             if job.folder not in self._running:
-                self._running[job.folder] = self._progress.add_task(escape(str(job)), total=job.frames, note="")
+                self._running[job.folder] = self._progress.add_task(escape(printable(job)), total=job.frames, note="")
             self._frames[job.folder] = event.frames
             self._progress.update(self._running[job.folder], completed=event.frames)
         else:

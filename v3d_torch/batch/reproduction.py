@@ -32,6 +32,7 @@ from v3d_torch.evaluation.summary import (
 from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_table
 from v3d_torch.io.files import write_text
 from v3d_torch.runs.open_sequences import open_sequence
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.result_folder import lock_results, make_result_folder
 
 TABLE_CONFIGS = (FULL, "paper", "baseline")
@@ -65,7 +66,7 @@ def run_reproduction(
         advice = describe_missing(missing, data_folder(data_root), reason)
         if not opened:
             raise InputError(advice)
-        console.print(advice, markup=False)
+        print_line(console, advice)
     prepare_stages(configs)
     folder = make_result_folder(out, "reproduce")
     sequences = {name: (name, sequence) for name, sequence in opened.items()}

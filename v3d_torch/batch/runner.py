@@ -20,6 +20,7 @@ from v3d_torch.errors import InputError, OutputError
 from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.open_sequences import open_sequences
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import progress_bars
 from v3d_torch.runs.result_folder import lock_results, make_result_folder
 
@@ -91,8 +92,10 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
     for table in record.screen_tables():
         console.print(table)
     if record.failed:
-        console.print("failed:", *map(str, record.failed), sep="\n", markup=False)
-    console.print(f"results: {folder}", markup=False)
+        console.print("failed:")
+        for outcome in record.failed:
+            print_line(console, str(outcome))
+    print_line(console, f"results: {folder}")
     total, failed = len(record.jobs), len(record.failed)
     if interrupted and (failed or record.missing):
         done = len(record.outcomes) - failed
@@ -121,11 +124,12 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                 for event in events:
                     show(event)
                     if isinstance(event, JobRepeated):
-                        progress.console.print(str(event), markup=False)
+                        print_line(progress.console, str(event))
                     if isinstance(event, JobFinished):
                         outcome = record.add(event)
-                        warnings = [f"warning: {warning}" for warning in outcome.warnings]
-                        progress.console.print(str(outcome), *warnings, sep="\n", markup=False)
+                        print_line(progress.console, str(outcome))
+                        for warning in outcome.warnings:
+                            print_line(progress.console, f"warning: {warning}")
                         progress.table = next(iter(record.screen_tables()), None)
                         try:
                             record.write()

@@ -58,6 +58,7 @@ def main(
         from v3d_torch.runs.interrupts import interrupts_between_frames
         from v3d_torch.runs.kernel_compilation import compile_kernels
         from v3d_torch.runs.open_sequences import check_groundtruth, print_notes
+        from v3d_torch.runs.print_line import print_line
         from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
         from v3d_torch.segmentation import make_segmenter
 
@@ -88,4 +89,4 @@ def main(
             )
         write_text(out, calibration_text(calibration, seq))
         console.print(calibration_table(calibration))
-        console.print(f"camera: {out}", markup=False)
+        print_line(console, f"camera: {out}")

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, V3DError
+from v3d_torch.io.text import printable
 
 
 @contextmanager
@@ -19,17 +20,16 @@ def exit_on_error() -> Iterator[None]:
                 warnings.simplefilter("ignore", reported)
             yield
     except V3DError as error:
-        print(f"error: {_printable(error)}", file=sys.stderr)
+        print(f"error: {printable(error)}", file=sys.stderr)
         sys.exit(2)
     except OSError as error:  # of a path given by the user, such as a folder without permission or too long a name
-        path, reason = error.filename or "a file", error.strerror or error
-        print(f"error: {_printable(path)}: cannot be used ({reason}); check path and permissions", file=sys.stderr)
+        reason = error.strerror or error
+        if error.filename is None:  # of an open file, such as the standard output on a full disk
+            message = f"reading or writing failed ({reason}); check the disk, and where the output goes"
+        else:
+            message = f"{error.filename}: cannot be used ({reason}); check path and permissions"
+        print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("error: interrupted before the results were written", file=sys.stderr)
         sys.exit(2)
-
-
-def _printable(value: object) -> str:
-    """Return a text in one line, without the control characters that file names and contents can have."""
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
 from v3d_torch.runtime.imports import quick_imports
@@ -46,11 +47,12 @@ def main(
         from v3d_torch.datasets.sequence_names import find_paper_sequence
         from v3d_torch.datasets.tum_extents import describe_estimate_difference
         from v3d_torch.datasets.tum_trajectory import read_trajectory
-        from v3d_torch.errors import InputError, V3DError
+        from v3d_torch.errors import InputError
         from v3d_torch.evaluation import evaluate
         from v3d_torch.evaluation.paper_tables import make_paper_table
+        from v3d_torch.runs.print_line import print_line
 
-    try:
+    with exit_on_error():
         truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)
         if sequence is not None and find_paper_sequence(sequence) is None:
             raise InputError(f"--sequence {sequence}: is not in the paper's tables; use a name such as fr3/w/xyz")
@@ -58,23 +60,20 @@ def main(
             evaluation = evaluate(truth, poses, max_time_difference=max_difference, rpe_delta=delta, frames=frames)
         except InputError as error:
             raise InputError(f"{groundtruth}, {estimate}: {error}") from error
-    except V3DError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from error
-    if as_json:
-        import json
+        if as_json:
+            import json
 
-        typer.echo(json.dumps(evaluation.to_dict(), indent=2))
-        return
-    console = Console(soft_wrap=True, highlight=False)
-    console.print(_error_table(evaluation))
-    for note in evaluation.notes:
-        console.print(f"note: {note}")
-    texts = (groundtruth.as_posix(), estimate.as_posix()) if sequence is None else (sequence,)
-    name = next(filter(None, map(find_paper_sequence, texts)), None)
-    if name is not None:
-        difference = describe_estimate_difference(name, poses, truth)
-        console.print(make_paper_table(name, evaluation, difference))
+            typer.echo(json.dumps(evaluation.to_dict(), indent=2))
+            return
+        console = Console(soft_wrap=True, highlight=False)
+        console.print(_error_table(evaluation))
+        for note in evaluation.notes:
+            print_line(console, f"note: {note}")
+        texts = (groundtruth.as_posix(), estimate.as_posix()) if sequence is None else (sequence,)
+        name = next(filter(None, map(find_paper_sequence, texts)), None)
+        if name is not None:
+            difference = describe_estimate_difference(name, poses, truth)
+            console.print(make_paper_table(name, evaluation, difference))
 
 
 def _error_table(evaluation: Evaluation) -> Table:

@@ -23,6 +23,7 @@ from v3d_torch.io.files import check_empty_folder
 from v3d_torch.io.ply import read_ply_points
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import RunRequest, read_request
 from v3d_torch.runs.run_images import LocatedFrames, located_frames, open_images, posed_images
@@ -86,9 +87,9 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
     notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
     if left_out := len(run.metrics.status) - len(located_frames(run)):
         notes.append(f"{left_out} frames without a known pose are left out")
-    console.print(f"{len(frames)} images: {out}", markup=False)
+    print_line(console, f"{len(frames)} images: {out}")
     for note in notes:
-        console.print(f"note: {note}", markup=False)
+        print_line(console, f"note: {note}")
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ def main(
         from v3d_torch.errors import ConfigError, InputError
         from v3d_torch.runs.interrupts import interrupts_between_frames
         from v3d_torch.runs.open_sequences import print_notes
+        from v3d_torch.runs.print_line import print_line
 
     console = Console(soft_wrap=True)
     with exit_on_error():
@@ -73,6 +74,6 @@ def main(
             raise InputError(f"{failure} (the {frames} frames before are saved in {out})")
         if not frames:
             raise InputError(f"{seq}: the source ended before its first frame")
-        console.print(f"{frames} frames: {out}", markup=False)
+        print_line(console, f"{frames} frames: {out}")
         if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
             raise InputError(f"{source.groundtruth_error} (the frames are saved in {out} without ground truth)")

@@ -30,10 +30,11 @@ def main(
     """
     with quick_imports():
         from v3d_torch.io.files import write_text
+        from v3d_torch.io.text import printable
         from v3d_torch.runs.report_page import render_page
         from v3d_torch.runs.stored_run import read_run
 
     with exit_on_error():
         run = read_run(folder, groundtruth)
         write_text(folder / "report.html", render_page(run))
-        typer.echo(f"report: {folder / 'report.html'}")
+        typer.echo(f"report: {printable(folder / 'report.html')}")

@@ -26,6 +26,7 @@ from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.open_sequences import print_notes
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
@@ -126,7 +127,7 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
         V3DError: If there is no checkpoint, if an option conflicts with the run, or as for `start_run`.
     """
     if is_finished(folder):
-        Console(soft_wrap=True).print(f"{folder}: the run is finished; nothing to resume", markup=False)
+        print_line(Console(soft_wrap=True), f"{folder}: the run is finished; nothing to resume")
         return
     checkpoint = read_checkpoint(folder)
     request = checkpoint.request
@@ -171,7 +172,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if checkpoint is not None:
         total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
-        console.print(f"resuming after {checkpoint.frames} of {total} frames", markup=False)
+        print_line(console, f"resuming after {checkpoint.frames} of {total} frames")
     try:
         pipeline, evaluation = run_with_progress(
             lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
@@ -228,12 +229,12 @@ def _print_summary(
     if display.profile and record.times:
         console.print(profile_table(record))
     for note in evaluation.notes if evaluation is not None else ():
-        console.print(f"note: {note}", markup=False)
+        print_line(console, f"note: {note}")
     for warning in record.warnings:
-        console.print(f"warning: {warning}", markup=False)
+        print_line(console, f"warning: {warning}")
     if record.save_error is not None:
-        console.print(f"note: no checkpoint was saved, {record.save_error}", markup=False)
-    console.print(f"results: {folder}", markup=False)  # the name can contain brackets
+        print_line(console, f"note: no checkpoint was saved, {record.save_error}")
+    print_line(console, f"results: {folder}")
     if record.failure is not None:
         frames = len(pipeline.slam.poses)
         results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from v3d_torch.io.text import printable
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -67,7 +69,7 @@ def find_difference(outcomes: Iterable[Outcome], sequence: str) -> str | None:
 
 def label_sequence(sequence: str, difference: str | None) -> str:
     """Return the name of a sequence in tables, followed by its difference to the sequence of the benchmark, if any."""
-    return sequence if difference is None else f"{sequence} ({difference})"
+    return printable(sequence if difference is None else f"{sequence} ({difference})")
 
 
 def collect_metric(outcomes: Iterable[Outcome], key: str) -> list[float]:

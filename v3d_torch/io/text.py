@@ -1,4 +1,4 @@
-"""Reading of text files, with a bound on their size and errors that name the expected content."""
+"""Reading of text files, with a bound on their size and errors that name the expected content; texts to show."""
 
 from __future__ import annotations
 
@@ -27,6 +27,15 @@ def replace_odd_spaces(text: str) -> str:
         text: Text of a configuration or of numbers. A file name can contain these characters on purpose.
     """
     return text.translate(_ODD_SPACES)
+
+
+def printable(value: object) -> str:
+    """Return a text in one line, with escapes in place of the control characters that names and contents can have.
+
+    Args:
+        value: Text, or an object that is converted to one, such as a path.
+    """
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))
 
 
 def read_text(path: Path, expected: str) -> str:

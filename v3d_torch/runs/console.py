@@ -15,6 +15,7 @@ from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.log import log_to, show_warnings
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
 from v3d_torch.runs.result_folder import clear_earlier_results, lock_results
 from v3d_torch.runs.run import Run
@@ -47,7 +48,7 @@ def run_with_progress(
             clear_earlier_results(folder)
         compile_kernels(console)
         log = log_to(folder / "run.log", append=checkpoint is not None)
-        warnings = show_warnings(partial(console.print, markup=False))
+        warnings = show_warnings(partial(print_line, console))
         with progress_bars(console) as progress, interrupts_between_frames(sequence) as interrupted, log, warnings:
             run = make_run()
             total = len(sequence) if isinstance(sequence, Sized) else None

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from v3d_torch.errors import OutputError
+from v3d_torch.io.text import printable
 
 _LOG = logging.getLogger("v3d_torch")
 
@@ -31,7 +32,7 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
         handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another folder with --out") from error
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    handler.setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
     _LOG.addHandler(handler)
     _LOG.setLevel(logging.INFO)
     _LOG.propagate = False
@@ -54,6 +55,16 @@ def show_warnings(show: Callable[[str], object]) -> Iterator[None]:
         yield
     finally:
         _LOG.removeHandler(handler)
+
+
+class _OneLine(logging.Formatter):
+    """Format of a log in which each message is one line, also if a name in it contains line breaks."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return printable(super().formatMessage(record))
+
+    def format(self, record: logging.LogRecord) -> str:  # with the traceback, if there is one
+        return "\n".join(map(printable, super().format(record).split("\n")))
 
 
 class _Warnings(logging.Handler):

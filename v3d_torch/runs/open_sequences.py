@@ -11,6 +11,7 @@ from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
+from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 
 _MANY_PIXELS = 1 << 22
@@ -40,7 +41,7 @@ def print_notes(source: RGBDStream, console: Console) -> None:
             " camera file down if there is less"
         )
     for note in notes:
-        console.print(f"note: {source.name}: {note}", markup=False, highlight=False)
+        print_line(console, f"note: {source.name}: {note}")
 
 
 def check_groundtruth(source: RGBDStream) -> None:

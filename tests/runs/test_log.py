@@ -1,0 +1,23 @@
+"""Log file of a run, and warnings on the console."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from v3d_torch.runs.log import log_to
+
+LOG = logging.getLogger("v3d_torch.test")
+
+
+def test_message_is_one_line_without_control_characters(tmp_path: Path) -> None:
+    """A file name can contain line breaks, which would forge a line of the log, and commands for the terminal."""
+    path, name = tmp_path / "run.log", "a\n2026-01-01 00:00:00,000 ERROR forged\x1b]0;title\x1b\\"
+    with pytest.raises(ValueError, match="forged"), log_to(path):
+        LOG.warning("%s is broken", name)
+        raise ValueError(name)
+    text = path.read_text()
+    assert text.splitlines()[0].endswith("forged\\x1b]0;title\\x1b\\ is broken")
+    assert "Traceback (most recent call last):\n" in text and "\x1b" not in text
