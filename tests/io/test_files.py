@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import cv2
 import numpy as np
@@ -23,6 +26,34 @@ def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
         raise ZeroDivisionError
     assert path.read_text(encoding="utf-8") == "höhe\n"
     assert [entry.name for entry in path.parent.iterdir()] == ["table.txt"]
+
+
+def test_threads_that_write_the_same_file_do_not_disturb_each_other(tmp_path: Path) -> None:
+    path, barrier = tmp_path / "table.txt", Barrier(4)
+
+    def write(text: str) -> None:
+        with atomic_write(path) as temporary:
+            barrier.wait(10)
+            temporary.write_text(text)
+            barrier.wait(10)
+            assert temporary.read_text() == text
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(write, "abcd"))
+    assert path.read_text() in "abcd" and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such permissions")
+def test_written_file_has_the_permissions_of_any_new_file(tmp_path: Path) -> None:
+    (tmp_path / "plain.txt").touch()
+    write_text(tmp_path / "table.txt", "")
+    assert (tmp_path / "table.txt").stat().st_mode == (tmp_path / "plain.txt").stat().st_mode
+
+
+def test_longest_name_of_a_file_can_be_written(tmp_path: Path) -> None:
+    path = tmp_path / f"{'x' * 251}.txt"
+    write_text(path, "text")
+    assert path.read_text() == "text"
 
 
 def test_file_that_cannot_be_written_is_named(tmp_path: Path) -> None:

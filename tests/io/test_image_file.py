@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.corpus.images import bomb
 
 from v3d_torch.datasets.demo.pictures import load_photograph
 from v3d_torch.errors import InputError
@@ -28,8 +29,16 @@ def test_image_is_that_of_opencv(tmp_path: Path) -> None:
 def test_file_that_is_not_an_image_gives_none(tmp_path: Path) -> None:
     (tmp_path / "empty.png").touch()
     (tmp_path / "text.png").write_text("text")
-    for name in ("missing.png", "empty.png", "text.png", "."):
+    (tmp_path / "header.png").write_bytes(bomb(5, 7, 8, 0)[:20])
+    (tmp_path / "empty image.png").write_bytes(bomb(0, 7, 8, 0))
+    for name in ("missing.png", "empty.png", "text.png", "header.png", "empty image.png", "."):
         assert read_image(tmp_path / name, cv2.IMREAD_COLOR) is None
+
+
+@pytest.mark.parametrize("side", [60_000, 9_000])
+def test_image_that_would_fill_the_memory_is_not_decoded(side: int, tmp_path: Path) -> None:
+    (tmp_path / "large.png").write_bytes(bomb(side, side, 8, 0))
+    assert read_image(tmp_path / "large.png", cv2.IMREAD_GRAYSCALE) is None
 
 
 def test_no_image_is_opened_by_opencv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -44,6 +53,6 @@ def test_no_image_is_opened_by_opencv(tmp_path: Path, monkeypatch: pytest.Monkey
     assert _masked_fraction(path) == 0.25
     assert _read_mask(path, (2, 2)).tolist() == [[True, False], [True, True]]  # type: ignore[arg-type]
     assert embed_image(path).startswith("data:image/webp;base64,")
-    assert load_photograph("cup.png").shape[2] == 4
+    assert load_photograph("cup.png").shape[2] == 4 and load_photograph("cat.jpg").shape[2] == 3
     with pytest.raises(InputError, match="install the package again"):
         load_photograph("missing.png")

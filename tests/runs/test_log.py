@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from pathlib import Path
 
 import pytest
@@ -21,3 +22,13 @@ def test_message_is_one_line_without_control_characters(tmp_path: Path) -> None:
     text = path.read_text()
     assert text.splitlines()[0].endswith("forged\\x1b]0;title\\x1b\\ is broken")
     assert "Traceback (most recent call last):\n" in text and "\x1b" not in text
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links on Windows need special permissions")
+def test_new_log_replaces_a_link_and_keeps_its_target(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("own notes")
+    (tmp_path / "run.log").symlink_to(tmp_path / "notes.txt")
+    with log_to(tmp_path / "run.log"):
+        LOG.warning("a frame is broken")
+    assert (tmp_path / "notes.txt").read_text() == "own notes"
+    assert (tmp_path / "run.log").read_text().endswith("a frame is broken\n")

@@ -40,6 +40,12 @@ def test_each_object_has_a_row_and_moving_objects_are_preferred() -> None:
     assert omitted == 19 and len(names) == 20 and {"person 1", "person 2", "person 3"} <= set(names)
 
 
+def test_class_name_is_drawn_as_it_is() -> None:
+    """The report reads names from a file, which need not be from this package."""
+    table = [ObjectRow(0.0, 1, r"$\frac{$ x", "static", 0, float("nan"))]
+    assert r"$\frac{$ x 1" in embed_svg(draw_object_timelines([0.0, 1.0], table, None)[0], "objects")
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_one_or_two_frames_are_drawn(frames: int) -> None:
     stamps = arc().stamps[:frames].tolist()

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from v3d_torch.datasets.images import MAX_PIXELS, is_depth_image, read_depth_image, too_large_error
+from v3d_torch.datasets.images import is_depth_image, read_depth_image, too_large_error
 from v3d_torch.errors import InputError
+from v3d_torch.io.image_file import MAX_PIXELS
 
 DEPTH_SUFFIXES = frozenset({".npy", ".exr"})
 """Suffixes of files, in lower case, that can only be depth images."""

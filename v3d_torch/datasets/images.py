@@ -17,16 +17,12 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from v3d_torch.datasets.png import PNG_SIGNATURE, Pixels, decode_png
+from v3d_torch.datasets.png import Pixels, decode_png
 from v3d_torch.errors import InputError
+from v3d_torch.io.image_file import MAX_PIXELS, PNG_SIGNATURE
 
 _FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "PPM", "WEBP")
 """Formats that Pillow is allowed to open: some of its other decoders start external programs."""
-
-MAX_PIXELS = 1 << 26
-"""Maximum number of pixels of an image, far more than those of any RGB-D camera. The header of a small file can state
-an image that would fill the memory."""
-
 
 _MAX_BYTES = 8 * MAX_PIXELS
 """Number of bytes that are read of a file at most: 16-bit RGB images of `MAX_PIXELS` without compression have fewer."""

@@ -14,11 +14,9 @@ import numpy as np
 from kornia_rs import io
 from numpy.typing import NDArray
 
+from v3d_torch.io.image_file import PNG_SIGNATURE
 from v3d_torch.kernels import png_filters as kernels
 from v3d_torch.kernels.compiler import compiled_by
-
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-"""First bytes of a PNG image."""
 
 _HEADER = struct.Struct(">2I5B")
 """Width, height, bits of a value, colour type, methods of compression and filtering, interlacing."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EISDIR
@@ -21,14 +22,17 @@ from v3d_torch.errors import OutputError
 def atomic_write(path: Path) -> Iterator[Path]:
     """Yield a temporary path next to ``path``, and rename it to ``path`` if the block succeeds.
 
-    The temporary path keeps the suffix, because some writers choose the format by suffix.
+    The temporary path is that of a new, empty file. It keeps the suffix, because some writers choose the format by
+    suffix.
 
     Raises:
         OutputError: If the folder cannot be written or the disk is full.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    # A name that nobody can predict: in a shared folder, another user could put a link to a file of this user there.
+    temporary = path.with_name(f".{secrets.token_hex(8)}.part{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch(exist_ok=False)
         yield temporary
         temporary.replace(path)
     except OSError as error:

@@ -27,7 +27,9 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
     """
     try:
         if not append:
-            path.write_text("")
+            if path.is_symlink():  # to a file that is not of a run, and stays as it is
+                path.unlink()
+            path.write_text("")  # not replaced, because the output of a batch's process already goes to the file
         # Append mode: if the interpreter crashes, faulthandler can write its report to the same file.
         handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
     except OSError as error:

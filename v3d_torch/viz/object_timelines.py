@@ -80,7 +80,8 @@ def draw_object_timelines(
     for axes, (rows, draw) in zip(all_axes, panels, strict=True):
         draw(axes, seconds)
         axes.set_ylim(len(rows), 0)
-        axes.set_yticks(np.arange(len(rows)) + 0.5, [labels[ids[i]] for i in rows], fontsize="x-small")
+        names = [labels[ids[i]] for i in rows]
+        axes.set_yticks(np.arange(len(rows)) + 0.5, names, fontsize="x-small", parse_math=False)
         axes.grid(False)
     present = {parse_motion_state(row.motion_state) for row in table}
     handles = [Patch(color=colour, label=name) for name, colour in MOTION_STATE_COLOURS.items() if name in present]
