@@ -24,7 +24,7 @@ PACKAGE = Path(v3d_torch.__file__).parent
 ROOT = PACKAGE.parent
 SOURCES = (
     *("pyproject.toml", "MANIFEST.in", "README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "constraints.txt"),
-    "mkdocs.yml",
+    *("CONTRIBUTING.md", "mkdocs.yml"),
     *("v3d_torch", "tests", "benchmarks", "notebooks", "examples", "docs"),
 )
 """Files and folders of a checkout, without the leftovers of builds and runs."""
@@ -100,10 +100,7 @@ def test_source_archive_contains_tests_and_documents(built: tuple[Path, Path, Pa
     with tarfile.open(built[0]) as archive:
         contained = {name.partition("/")[2] for name in archive.getnames()}
     tests = {f"tests/{name}" for name in files_in(ROOT / "tests")}
-    assert (
-        tests | {"constraints.txt", "CITATION.cff", "CHANGELOG.md", "LICENSE", "mkdocs.yml", "docs/index.md"}
-        <= contained
-    )
+    assert tests | {name for name in SOURCES if (ROOT / name).is_file()} | {"docs/index.md"} <= contained
     assert not [name for name in contained if re.search(r"__pycache__|\.pyc$|^results|^build", name)]
 
 
