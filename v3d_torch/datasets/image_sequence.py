@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,6 +144,6 @@ class ImageSequence(StoredSequence):
 
 def _explain_missing(file: Path) -> str:
     """Return the fix for a listed file that does not exist, for messages."""
-    if "\\" in str(file):
+    if any(PureWindowsPath(part).drive for part in file.absolute().parts[1:]):  # the first is that of this machine
         return "the list has Windows paths; write them relative to its folder, such as rgb/1.png"
     return "copy the whole sequence again"

@@ -120,6 +120,22 @@ CASES = [
             " has Windows paths; write them relative to its folder, such as rgb/1.png"
         ),
     ),
+    Case(
+        "paths of a disk of Windows with slashes",
+        edit("rgb.txt", replace_text("rgb/", "C:/data/rgb/")),
+        Fails(
+            "{seq}/C:/data/rgb/1305031102.000000.png: is listed but does not exist (8 missing in total); the list has"
+            " Windows paths; write them relative to its folder, such as rgb/1.png"
+        ),
+    ),
+    Case(
+        "missing file with a backslash in its name",
+        edit("rgb.txt", replace_text("rgb/", "rgb/left\\")),
+        Fails(
+            "{seq}/rgb/left\\1305031102.000000.png: is listed but does not exist (8 missing in total); copy the whole"
+            " sequence again"
+        ),
+    ),
     Case("no-break spaces", edit("rgb.txt", replace_text(" ", "\u00a0")), Succeeds()),
     Case("no-break spaces at the ends of lines", edit("depth.txt", replace_text("\n", "\u00a0\n")), Succeeds()),
     Case("invisible spaces", edit("rgb.txt", replace_text(" ", "\u200b \u200b")), Succeeds()),
