@@ -6,12 +6,14 @@ from typing import Any
 
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from v3d_torch.export.ros.frames import map_frame
 from v3d_torch.export.ros.markers import Marker, object_markers
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.objects.object_state import ObjectState
+from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
 
 MASK = torch.zeros(2, 2, dtype=torch.bool)
 CLOUD = torch.cartesian_prod(torch.tensor([1.0, 2.0]), torch.tensor([-0.5, 1.5]), torch.tensor([4.0, 4.5]))
@@ -68,7 +70,8 @@ def test_name_is_above_the_box_in_the_colour_of_the_motion_state() -> None:
     name, box = markers["names"], markers["boxes"]
     assert (name.type, name.text) == (Marker.TEXT_VIEW_FACING, "person 7, dynamic")
     assert name.pose.position.z > box.pose.position.z + box.scale.z / 2
-    assert (name.color.r, name.color.a, box.color.a) == (pytest.approx(0xD6 / 255), 1.0, pytest.approx(0.4))
+    assert (name.color.r, name.color.g, name.color.b) == pytest.approx(to_rgb(MOTION_STATE_COLOURS["dynamic"]))
+    assert (name.color.a, box.color.a) == (1.0, pytest.approx(0.4))
 
 
 def test_velocity_of_dynamic_object_is_an_arrow_to_its_place_a_second_later() -> None:
