@@ -240,6 +240,17 @@ def test_masked_percentages_are_shown_as_far_as_measured(
 
 
 @pytest.mark.usefixtures("without_plots")
+def test_frames_that_were_not_tracked_are_counted_by_status(copy: Path) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    count = len(metrics["status"])
+    assert "frames lost" not in " ".join(page_of(copy).text.split())
+    metrics["status"][-3:] = ["odometry", "lost", "lost"]
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    text = " ".join(page_of(copy).text.split())
+    assert f"{count - 3} frames tracked 1 frames by odometry 2 frames lost" in text and "disconnected" not in text
+
+
+@pytest.mark.usefixtures("without_plots")
 def test_page_of_run_without_objects(tmp_path: Path) -> None:
     run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
     page = page_of(tmp_path)
