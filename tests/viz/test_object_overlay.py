@@ -126,7 +126,7 @@ def test_labels_at_the_same_place_do_not_cover_each_other() -> None:
     mask[20:25, 58:64] = True
     objects = [(mask, f"dining table {number}", "static") for number in range(4)]
     draw_objects(axes, torch.zeros(3, 48, 64, dtype=torch.uint8), objects)
-    separate_labels(figure, axes)
+    separate_labels(figure)
     figure.draw_without_rendering()  # moves the boxes to the labels
     patches = [text.get_bbox_patch() for text in axes.texts]
     boxes = [patch.get_window_extent() for patch in patches if patch is not None]
@@ -140,6 +140,6 @@ def test_label_without_a_place_is_hidden() -> None:
     axes = figure.add_subplot()
     for number in range(30):
         axes.annotate(f"name {number}", (0.5, 0.5))
-    separate_labels(figure, axes)
+    separate_labels(figure)
     shown = [text for text in axes.texts if text.get_visible()]
     assert 1 <= len(shown) < 10

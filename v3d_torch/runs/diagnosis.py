@@ -7,7 +7,7 @@ import numpy as np
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation import evaluate
+from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.request import RunRequest
@@ -25,12 +25,13 @@ _MIN_IMAGE_SIZE = 96
 """Minimum number of rows and of columns of an image in which enough features are found in most scenes."""
 
 
-def diagnose(pipeline: Pipeline, request: RunRequest) -> str | None:
+def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | None) -> str | None:
     """Explain incomplete results of a run that ended without an error.
 
     Args:
         pipeline: Pipeline that has run.
         request: Inputs of the run.
+        evaluation: Its scores; None if there are none.
 
     Returns:
         One sentence with cause and fix; None if the results are complete.
@@ -39,7 +40,7 @@ def diagnose(pipeline: Pipeline, request: RunRequest) -> str | None:
     if not count:
         return f"{name}: has no frames; record it again"
     if pipeline.slam.poses.is_localised:
-        return pipeline.record.mask_error or _cause_of_missing_scores(pipeline)
+        return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
     if request.load_map is not None:
         return (
             f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
@@ -82,11 +83,11 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 
 
-def _cause_of_missing_scores(pipeline: Pipeline) -> str | None:
+def _cause_of_missing_scores(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
     sequence, trajectory = pipeline.sequence, pipeline.slam.poses.trajectory()
     if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
         return str(sequence.groundtruth_error)
-    if sequence.groundtruth is not None and len(trajectory) >= MIN_PAIRS:
+    if evaluation is None and sequence.groundtruth is not None and len(trajectory) >= MIN_PAIRS:
         try:
             evaluate(sequence.groundtruth, trajectory)
         except InputError as error:

@@ -31,6 +31,8 @@ from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
+from v3d_torch.runs.diagnosis import diagnose
+from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_tables import collect_tables
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
@@ -44,13 +46,17 @@ _LOG = logging.getLogger(__name__)
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
 
-def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Evaluation | None:
+def write_results(
+    folder: Path, pipeline: Pipeline, point_map: PointMap, request: RunRequest | None = None
+) -> Evaluation | None:
     """Write all results of a run, ``metrics.json`` last, so that its presence shows that they are complete.
 
     Args:
         folder: Folder of the results; made if it is missing.
         pipeline: Pipeline that has run, to the end of the sequence or not.
         point_map: Point map of the static scene, from `Pipeline.flush`.
+        request: Inputs of the run, with which incomplete results are explained in ``pipeline.record.diagnosis``; None
+            for no explanation.
 
     Returns:
         The scores, if there is ground truth.
@@ -59,6 +65,8 @@ def write_results(folder: Path, pipeline: Pipeline, point_map: PointMap) -> Eval
         OutputError: If the folder cannot be written or the disk is full.
     """
     tables = collect_tables(pipeline)
+    if request is not None and pipeline.record.failure is None:
+        pipeline.record.diagnosis = diagnose(pipeline, request, tables.evaluation)
     tables.write(folder)
     _write_maps(folder, pipeline, tables.trajectory, point_map)
     draw_run(folder / "figures", pipeline, tables.trajectory, point_map)

@@ -23,7 +23,6 @@ from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
-from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
@@ -96,7 +95,8 @@ class Run:
             remove_unfinished(folder)
             self.pipeline.load_state_dict(checkpoint.state)
             _LOG.info("resumed after %d frames", checkpoint.frames)
-        self._lacks_views = known_map is not None and len(known_map.views) == 0
+        if known_map is not None and len(known_map.views) == 0:
+            self.pipeline.warn([_NO_VIEWS])
         self._autosave = Autosave(folder, self.pipeline, request if save_checkpoints else None)
 
     def __call__(self, on_frame: FrameCallback) -> Evaluation | None:
@@ -117,8 +117,6 @@ class Run:
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
         if isinstance(sequence, ImageSequence):
             self.pipeline.warn(sequence.notes)
-        if self._lacks_views:
-            self.pipeline.warn([_NO_VIEWS])
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"
@@ -132,9 +130,7 @@ class Run:
         point_map = self.pipeline.flush(lambda: self._save_poses(is_whole=is_whole))
         from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
 
-        if record.failure is None:
-            record.diagnosis = diagnose(self.pipeline, self._request)
-        evaluation = write_results(self._folder, self.pipeline, point_map)
+        evaluation = write_results(self._folder, self.pipeline, point_map, self._request)
         self._autosave.discard()
         if problem := record.failure or record.diagnosis:
             _LOG.error(problem)

@@ -7,14 +7,18 @@ from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
 
-def separate_labels(figure: Figure, axes: Axes) -> None:
-    """Move the texts of axes into the axes, and down until none overlaps another; hide those without a place.
+def separate_labels(figure: Figure) -> None:
+    """Move the texts of all axes into their axes, and down until none overlaps another; hide those without a place.
 
     Args:
-        figure: Figure of the axes, with all of its content, because the layout determines the sizes.
-        axes: Axes with the texts.
+        figure: Figure with all of its content, because the layout determines the sizes.
     """
     figure.draw_without_rendering()  # determines the size of the axes and of the texts
+    for axes in figure.axes:
+        _separate(axes)
+
+
+def _separate(axes: Axes) -> None:
     labels, boxes = [text for text in axes.texts if text.get_text()], list[Bbox]()
     for label in sorted(labels, key=lambda text: text.get_window_extent().y0, reverse=True):
         start = label.get_window_extent()

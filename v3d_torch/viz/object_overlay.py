@@ -69,13 +69,11 @@ def save_mask_figure(images: Sequence[Tensor], overlays: Sequence[Sequence[Overl
         axes.axis("off")
     for axes, (image, objects) in zip(grid, frames, strict=False):
         draw_objects(axes, image, objects)
-        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     present = {parse_motion_state(motion_state) for _, objects in frames for _, _, motion_state in objects}
     handles = [Patch(color=colour, label=name) for name, colour in MOTION_STATE_COLOURS.items() if name in present]
     if handles:
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    for axes in grid:
-        separate_labels(figure, axes)
+    separate_labels(figure)
     save_figure(figure, path)
 
 

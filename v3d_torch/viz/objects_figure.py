@@ -77,7 +77,7 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     draw_title(axes.set_title, title)
-    separate_labels(figure, axes)
+    separate_labels(figure)
     return figure
 
 

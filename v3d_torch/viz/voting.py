@@ -86,7 +86,7 @@ def draw_voting(
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), title=title)
     handles = _legend_handles(objects, ineffective=bool(ineffective))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
-    separate_labels(figure, axes)
+    separate_labels(figure)
     return figure
 
 
