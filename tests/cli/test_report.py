@@ -74,7 +74,8 @@ def run_into(folder: Path, sequence: Wall, segment: Callable[[RGBDFrame], Instan
     config = load_config(overrides=["mapping.max_keyframe_interval=5", *overrides])
     pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segment, config), folder / "masks")
     pipeline()
-    write_results(folder, pipeline, pipeline.flush())
+    pipeline.flush()
+    write_results(folder, pipeline)
 
 
 @pytest.fixture(scope="module")

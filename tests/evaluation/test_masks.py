@@ -307,7 +307,8 @@ def run(folder: Path, out: Path) -> dict[str, object]:
     config = load_config(overrides=[*exact, "objects.clouds.stride=1"])
     pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, square, config), out / "masks")
     pipeline()
-    write_results(out, pipeline, pipeline.flush())
+    pipeline.flush()
+    write_results(out, pipeline)
     return json.loads((out / "metrics.json").read_text())
 
 

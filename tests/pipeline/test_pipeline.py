@@ -74,7 +74,8 @@ def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_
     pipeline = make_pipeline(Wall(broken=broken))
     record = pipeline()
     assert record.failure is not None and "truncated" in record.failure
-    evaluation = write_results(tmp_path, pipeline, pipeline.flush())
+    pipeline.flush()
+    evaluation = write_results(tmp_path, pipeline)
     lines = (tmp_path / "trajectory.txt").read_text().splitlines()
     assert len(lines) == broken
     assert (evaluation is not None) == (broken >= 3)
@@ -87,7 +88,8 @@ def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_
 def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> None:
     pipeline = make_pipeline(Wall(interrupted=4))
     assert pipeline().failure == f"interrupted after 4 of {FRAMES} frames"
-    write_results(tmp_path, pipeline, pipeline.flush())
+    pipeline.flush()
+    write_results(tmp_path, pipeline)
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
 
 
@@ -151,7 +153,8 @@ def test_part_of_the_map_whose_place_is_a_guess_is_uncertain_and_not_in_the_poin
     pipeline = Pipeline(Jump(), V3DSLAM(walls.CAMERA, config=config))
     results: list[FrameResult] = []
     pipeline(lambda frame, result: results.append(result))
-    points = pipeline.flush().points
+    pipeline.flush()
+    points = pipeline.fuse_points().points
     disconnected = [each for each in results if each.status is TrackingStatus.DISCONNECTED]
     assert len(disconnected) > 10
     for each in disconnected:  # a few tenths of a second after the last frame that was found

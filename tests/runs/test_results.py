@@ -26,7 +26,7 @@ from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs import results as results_module
 from v3d_torch.runs.metrics_file import read_metrics
-from v3d_torch.runs.results import write_intermediate_results, write_results
+from v3d_torch.runs.results import prepare_intermediate_results, write_results
 from v3d_torch.runs.run import describe_readout
 
 
@@ -39,7 +39,8 @@ def run() -> Pipeline:
 @pytest.fixture(scope="module")
 def results(run: Pipeline, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("results") / "new" / "folder"
-    write_results(folder, run, run.flush())
+    run.flush()
+    write_results(folder, run)
     return folder
 
 
@@ -99,7 +100,7 @@ def test_library_of_another_distribution_has_no_version(
 
     monkeypatch.setattr(results_module, "version", version_of)
     monkeypatch.setattr(results_module, "_versions", results_module._versions.__wrapped__)
-    write_intermediate_results(tmp_path, run)
+    prepare_intermediate_results(tmp_path, run)()
     versions = read_metrics(tmp_path / "metrics.json").versions
     assert versions["onnxruntime"] is None and versions["torch"] == torch.__version__
 
@@ -177,7 +178,8 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
     config, with_mesh = run.slam.config, load_config(overrides=["dense_map.mesh.enabled=true"])
     try:
         run.slam.config = with_mesh
-        write_results(tmp_path, run, run.flush())
+        run.flush()
+        write_results(tmp_path, run)
     finally:
         run.slam.config = config
     mesh = plyfile.PlyData.read(tmp_path / "mesh.ply")
@@ -188,7 +190,8 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
 def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:
     assert not {"occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml"} & {path.name for path in results.iterdir()}
     run = run_along_wall("occupancy.enabled=true")
-    write_results(tmp_path, run, run.flush())
+    run.flush()
+    write_results(tmp_path, run)
     assert (tmp_path / "trajectory.txt").read_bytes() == (results / "trajectory.txt").read_bytes()
     stored, wall = load_occupancy(tmp_path / "occupancy.npz"), torch.tensor([[0.0, 0.0, WALL]])
     assert stored.map.distance(wall - torch.tensor([0.0, 0.0, 0.5])).item() == pytest.approx(0.5, abs=0.05)
@@ -209,7 +212,8 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
     without_truth = Pipeline(Wall(), run.slam)
     without_truth.sequence.groundtruth = None  # type: ignore[misc]
     without_truth.record = replace(run.record)
-    assert write_results(tmp_path, without_truth, without_truth.flush()) is None
+    without_truth.flush()
+    assert write_results(tmp_path, without_truth) is None
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["ate"] is metrics["rpe"] is metrics["alignment"] is None and metrics["notes"] == []
     assert (metrics["frames"], metrics["poses"], metrics["coverage"], metrics["pairs"]) == (FRAMES, FRAMES, 1.0, 0)
@@ -219,14 +223,16 @@ def test_run_without_ground_truth_has_no_scores(run: Pipeline, tmp_path: Path) -
 
 def test_results_that_cannot_be_written_raise_an_error(run: Pipeline, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
+    run.flush()
     with pytest.raises(OutputError, match=r"file/trajectory\.txt: cannot be written"):
-        write_results(tmp_path / "file", run, run.flush())
+        write_results(tmp_path / "file", run)
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> None:
     again = run_along_wall()
-    write_results(tmp_path, again, again.flush())
+    again.flush()
+    write_results(tmp_path, again)
     for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "dynamics.parquet"):
         assert (tmp_path / name).read_bytes() == (results / name).read_bytes(), name
 

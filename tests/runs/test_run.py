@@ -16,6 +16,7 @@ from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.report_page import render_page
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_tables import ResultTables
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.stored_run import read_run
 from v3d_torch.types import RGBDFrame
@@ -37,6 +38,22 @@ def test_poses_and_sparse_map_are_written_before_the_point_map_is_fused(
     assert {"states.parquet", "dynamics.parquet", "room.npz"} <= {path.name for path in tmp_path.iterdir()}
     failure = read_metrics(tmp_path / "metrics.json").failure
     assert failure == f"killed or still running after {FRAMES} of {FRAMES} frames"
+
+
+def test_poses_and_tables_are_collected_and_written_once_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not once more after the fusion, which changes none of them."""
+    written: list[Path] = []
+    write = ResultTables.write
+
+    def count(tables: ResultTables, folder: Path) -> None:
+        written.append(folder)
+        write(tables, folder)
+
+    monkeypatch.setattr(ResultTables, "write", count)
+    Run(RunRequest("wall", Config()), Wall(), square, tmp_path)(lambda *_: None)
+    assert written == [tmp_path] and read_metrics(tmp_path / "metrics.json").failure is None
 
 
 class WallWithoutDepth(Wall):

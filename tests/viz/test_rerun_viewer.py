@@ -127,6 +127,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, RunLo
     pipeline = Pipeline(sequence, slam, viewer=make_viewer(None, path, sequence))
     run = pipeline(log)
     pipeline.flush()
+    pipeline.fuse_points()
     assert run.failure is None
     return Recording(path), log, pipeline
 
@@ -277,6 +278,7 @@ def test_only_the_recent_part_is_logged_until_the_map_has_grown(
     pipeline = Pipeline(sequence, slam, viewer=make_viewer(None, tmp_path / "run.rrd", sequence))
     assert pipeline(log).failure is None
     pipeline.flush()
+    pipeline.fuse_points()
     recording, last = Recording(tmp_path / "run.rrd"), FRAMES - 1
     whole, recent = recording.at("/world/map/keyframes"), recording.at("/world/map/keyframes/recent")
     points, newer = recording.at("/world/map/landmarks"), recording.at("/world/map/landmarks/recent")
@@ -344,6 +346,7 @@ def test_map_and_poses_are_logged_again_after_loop_correction(tmp_path: Path) ->
     pipeline = Pipeline(sequence, slam, viewer=viewer)
     pipeline(on_frame)
     pipeline.flush()
+    pipeline.fuse_points()
     recording = Recording(tmp_path / "run.rrd")
     moved = recording.at("/world/trajectory")[FRAMES - 1]["strips"][0]
     np.testing.assert_allclose(moved, slam.poses.trajectory().T_wc[:, :3, 3], atol=1e-6)
@@ -363,6 +366,7 @@ def test_ground_truth_without_orientations_is_not_logged(tmp_path: Path) -> None
     pipeline = Pipeline(sequence, V3DSLAM(CAMERA, squares), viewer=make_viewer(None, tmp_path / "run.rrd", sequence))
     pipeline()
     pipeline.flush()
+    pipeline.fuse_points()
     assert "/world/groundtruth" not in Recording(tmp_path / "run.rrd").entities
 
 
@@ -422,6 +426,7 @@ def test_incomplete_recording_is_a_failure_after_all_frames(tmp_path: Path) -> N
     pipeline = Pipeline(sequence, V3DSLAM(CAMERA, squares), viewer=viewer)
     pipeline()
     pipeline.flush()
+    pipeline.fuse_points()
     failure = pipeline.record.failure
     assert failure is not None and "the rerun recording is incomplete (File-writer" in failure
     assert len(pipeline.slam.poses.statuses) == FRAMES
@@ -469,6 +474,7 @@ def test_viewer_is_started_and_receives_the_run(
     assert listening == ["127.0.0.1"]  # private images must not be accessible from the network
     pipeline()
     pipeline.flush()
+    pipeline.fuse_points()
     assert list(Recording(file).at("/world/camera")) == [0, 1, 2]
     deadline = time.monotonic() + 20
     while (not saved.is_file() or saved.stat().st_size < 10_000) and time.monotonic() < deadline:

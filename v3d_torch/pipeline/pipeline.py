@@ -214,16 +214,8 @@ class Pipeline:
         return record
 
     @torch.inference_mode()
-    def flush(self, before_fusion: Callable[[], None] | None = None) -> PointMap:
-        """Apply the pending results of the back end, check the camera and show the final state, after the last frame.
-
-        Args:
-            before_fusion: Called when all poses are final, before the fusion of the point map, which takes long, and
-                much memory.
-
-        Returns:
-            Point map of the static scene, fused from the views whose place in the map is known.
-        """
+    def flush(self) -> None:
+        """Apply the pending results of the back end and check the camera, after the last frame: all poses are final."""
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
@@ -239,8 +231,14 @@ class Pipeline:
                     " guess: point map and mesh leave it out; return to a known place to join the parts"
                 ]
             )
-        if before_fusion is not None:
-            before_fusion()
+
+    @torch.inference_mode()
+    def fuse_points(self) -> PointMap:
+        """Fuse the point map, which takes long, and much memory, and show the final state, after `flush`.
+
+        Returns:
+            Point map of the static scene, fused from the views whose place in the map is known.
+        """
         trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
         point_map = fuse_points(self.views.connected(), self.slam.config)
         try:

@@ -8,7 +8,7 @@ import platform
 import re
 import sys
 from collections.abc import Callable, Sized
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -33,7 +33,7 @@ from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runs.diagnosis import diagnose
 from v3d_torch.runs.request import RunRequest
-from v3d_torch.runs.result_tables import collect_tables
+from v3d_torch.runs.result_tables import ResultTables, collect_tables
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
 from v3d_torch.viz.run_figures import draw_run
@@ -46,15 +46,15 @@ _LOG = logging.getLogger(__name__)
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
 
-def write_results(
-    folder: Path, pipeline: Pipeline, point_map: PointMap, request: RunRequest | None = None
-) -> Evaluation | None:
-    """Write all results of a run, ``metrics.json`` last, so that its presence shows that they are complete.
+def write_results(folder: Path, pipeline: Pipeline, request: RunRequest | None = None) -> Evaluation | None:
+    """Write all results of a run; once they are complete, ``metrics.json`` no longer names a failure.
+
+    Poses and tables are written before the point map is fused, so that they are not lost if the memory does not suffice
+    to fuse it.
 
     Args:
         folder: Folder of the results; made if it is missing.
-        pipeline: Pipeline that has run, to the end of the sequence or not.
-        point_map: Point map of the static scene, from `Pipeline.flush`.
+        pipeline: Pipeline that has run, to the end of the sequence or not, after `Pipeline.flush`.
         request: Inputs of the run, with which incomplete results are explained in ``pipeline.record.diagnosis``; None
             for no explanation.
 
@@ -64,31 +64,21 @@ def write_results(
     Raises:
         OutputError: If the folder cannot be written or the disk is full.
     """
-    tables = collect_tables(pipeline)
-    if request is not None and pipeline.record.failure is None:
-        pipeline.record.diagnosis = diagnose(pipeline, request, tables.evaluation)
-    tables.write(folder)
+    tables, record = collect_tables(pipeline), pipeline.record
+    metrics = _metrics(pipeline, tables.evaluation)
+    _write_tables(folder, tables, metrics)
+    point_map = pipeline.fuse_points()
+    if request is not None and record.failure is None:
+        record.diagnosis = diagnose(pipeline, request, tables.evaluation)
     _write_maps(folder, pipeline, tables.trajectory, point_map)
     draw_run(folder / "figures", pipeline, tables.trajectory, point_map)
-    _write_metrics(folder, _metrics(pipeline, tables.evaluation, pipeline.record.failure))
+    metrics |= {"failure": record.failure, "diagnosis": record.diagnosis, "peak_memory_mb": _peak_memory_mb()}
+    _write_metrics(folder, metrics)
     return tables.evaluation
 
 
-def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
-    """Write the results so far of a run in progress, without maps and figures, which take seconds.
-
-    Args:
-        folder: Folder of the results; made if it is missing.
-        pipeline: Pipeline between two frames.
-
-    Raises:
-        OutputError: If the folder cannot be written or the disk is full.
-    """
-    prepare_intermediate_results(folder, pipeline)()
-
-
 def prepare_intermediate_results(folder: Path, pipeline: Pipeline) -> Callable[[], None]:
-    """Collect what `write_intermediate_results` writes.
+    """Collect the results so far of a run in progress, without maps and figures, which take seconds.
 
     Args:
         folder: Folder of the results; made if it is missing.
@@ -99,28 +89,26 @@ def prepare_intermediate_results(folder: Path, pipeline: Pipeline) -> Callable[[
         continue meanwhile in another thread.
     """
     tables = collect_tables(pipeline)
-    done = len(pipeline.slam.poses)
-    total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
-    failure = f"killed or still running after {done}{total} frames"
-    metrics = _metrics(pipeline, tables.evaluation, failure)
+    return partial(_write_tables, folder, tables, _metrics(pipeline, tables.evaluation))
 
-    def write() -> None:
-        tables.write(folder)
-        _write_metrics(folder, metrics)
 
-    return write
+def _write_tables(folder: Path, tables: ResultTables, metrics: dict[str, object]) -> None:
+    tables.write(folder)
+    _write_metrics(folder, metrics)
 
 
 def _write_metrics(folder: Path, metrics: dict[str, object]) -> None:
     write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
 
-def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | None) -> dict[str, object]:
+def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, object]:
+    """Return the metrics of a run whose results are not complete yet."""
     slam, run = pipeline.slam, pipeline.record
     statuses = slam.poses.statuses
     frames = len(statuses)
     counts = {status.value: statuses.count(status) for status in TrackingStatus}
     masks = run.mask_evaluation.compute_scores()
+    total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
     return {
         **(absent_scores(frames, pipeline.frame_count) if evaluation is None else evaluation.to_dict()),
         "masks": masks.to_dict() if masks is not None else None,
@@ -141,7 +129,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None, failure: str | N
         "warnings": list(run.warnings),
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "T_lw": None if (T_lw := slam.T_lw) is None else T_lw.tolist(),
-        "failure": failure,
+        "failure": f"killed or still running after {frames}{total} frames",
         "diagnosis": run.diagnosis,
         "latency": run.live.latency_statistics(),
         "dropped": run.live.dropped,

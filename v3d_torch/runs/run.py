@@ -127,24 +127,18 @@ class Run:
         record = self.pipeline(log_and_save)
         is_whole = record.failure is None  # also if a viewer cannot write its file afterwards
         self._autosave.end()
-        point_map = self.pipeline.flush(lambda: self._save_poses(is_whole=is_whole))
-        from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
-
-        evaluation = write_results(self._folder, self.pipeline, point_map, self._request)
-        self._autosave.discard()
-        if problem := record.failure or record.diagnosis:
-            _LOG.error(problem)
-        return evaluation
-
-    def _save_poses(self, *, is_whole: bool) -> None:
-        """Write what does not need the point map, so that it is not lost if the memory does not suffice to fuse it."""
-        from v3d_torch.runs.results import write_intermediate_results
-
+        self.pipeline.flush()
         slam = self.pipeline.slam
         _LOG.info("readout: %s", describe_readout(slam.map.readout, slam.config.rolling_shutter))
         if self._map_file is not None:
             self._save_map(self._map_file, is_whole=is_whole)
-        write_intermediate_results(self._folder, self.pipeline)
+        from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
+
+        evaluation = write_results(self._folder, self.pipeline, self._request)
+        self._autosave.discard()
+        if problem := record.failure or record.diagnosis:
+            _LOG.error(problem)
+        return evaluation
 
     def _save_map(self, path: Path, *, is_whole: bool) -> None:
         """Write the map file; a part of a map is written beside a map file that exists, and does not replace it."""

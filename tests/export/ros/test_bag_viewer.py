@@ -57,7 +57,8 @@ class Recorded:
         slam = V3DSLAM(CAMERA, squares, CONFIG)
         self.pipeline = Pipeline(sequence or Wall(), slam, viewer=BagViewer(path, CAMERA))
         self.pipeline(self._on_frame)
-        self.point_map: PointMap = self.pipeline.flush()
+        self.pipeline.flush()
+        self.point_map: PointMap = self.pipeline.fuse_points()
 
     def _on_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.T_wc.append(result.T_wc)
@@ -203,7 +204,8 @@ def test_same_run_writes_the_same_bytes(recorded: Recorded, tmp_path: Path) -> N
 def test_poses_are_the_same_with_and_without_a_bag(recorded: Recorded) -> None:
     pipeline = Pipeline(Wall(), V3DSLAM(CAMERA, squares, CONFIG))
     pipeline()
-    assert torch.equal(pipeline.flush().points, recorded.point_map.points)
+    pipeline.flush()
+    assert torch.equal(pipeline.fuse_points().points, recorded.point_map.points)
     trajectory = recorded.pipeline.slam.poses.trajectory()
     assert torch.equal(pipeline.slam.poses.trajectory().T_wc, trajectory.T_wc)
 
@@ -222,6 +224,7 @@ def test_correction_of_the_map_changes_map_to_odom_only(tmp_path: Path) -> None:
     pipeline = Pipeline(Wall(), slam, viewer=viewer)
     pipeline(on_frame)
     pipeline.flush()
+    pipeline.fuse_points()
     before, after = (tf for _, tf in read_with_mcap(tmp_path / "run.mcap")["/tf"][-2:])
     np.testing.assert_allclose(lookup(after, "odom", "camera_link"), lookup(before, "odom", "camera_link"), atol=1e-9)
     moved = np.linalg.norm(lookup(after, "map", "odom")[:3, 3] - lookup(before, "map", "odom")[:3, 3])
