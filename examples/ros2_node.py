@@ -70,7 +70,7 @@ class SlamNode(Node):
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
         times = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
-        stamp = times[0] + 5e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
+        stamp = times[0] + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
         try:
             rgb, measured = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
             images = rgb, measured, self.camera

@@ -8,12 +8,23 @@ import numpy as np
 import pytest
 import torch
 from helpers.bag_messages import matrix_of
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import OutputError
-from v3d_torch.export.ros.messages import camera_info, header, occupancy_grid, odometry, path, pose, transforms
+from v3d_torch.export.ros.messages import (
+    camera_info,
+    header,
+    nanoseconds,
+    occupancy_grid,
+    odometry,
+    path,
+    pose,
+    transforms,
+)
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
@@ -48,6 +59,17 @@ def test_header_has_seconds_and_nanoseconds() -> None:
     assert (message.stamp.sec, message.frame_id) == (1311868164, "map")
     assert abs(message.stamp.nanosec - 363181000) < 300  # a float64 has no more digits
     assert (round_trip(header(1.9999999999, "")).stamp.sec, header(0.0, "").stamp.nanosec) == (2, 0)
+
+
+@given(stamp=st.floats(2**23, 2**31, exclude_max=True))
+def test_time_of_a_header_is_read_as_the_same_timestamp(stamp: float) -> None:
+    time = header(stamp, "").stamp
+    assert time.sec + time.nanosec * 1e-9 == stamp
+
+
+@given(microseconds=st.integers(0, 2**31 * 10**6 - 1))
+def test_time_in_microseconds_is_exact(microseconds: int) -> None:
+    assert nanoseconds(microseconds / 10**6) == 1000 * microseconds
 
 
 @pytest.mark.parametrize("stamp", [-0.1, 2.0**31, np.nan, np.inf])
