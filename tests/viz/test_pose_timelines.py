@@ -91,6 +91,17 @@ def test_cells_of_frames_leave_gaps_empty() -> None:
     np.testing.assert_array_equal(cells, [[1, 2, 3, np.nan, 4, 5]])
 
 
+def test_curves_and_bars_are_interrupted_at_the_same_gaps() -> None:
+    """Dropped frames, here three, are no gap; eight seconds without any are one."""
+    stamps = torch.tensor([0, 1, 2, 3, 7, 8, 9, 17, 18, 19], dtype=torch.float64)
+    (curve,) = draw_positions(None, Trajectory(stamps, arc().T_wc[:10]), None).axes[0].lines
+    bars = draw_statuses(stamps, ["tracked"] * 10, stamps[:1]).axes[0].collections[0].get_array()
+    for values in (curve.get_ydata(), np.ma.filled(bars, np.nan).ravel()):
+        assert np.flatnonzero(np.isnan(values)).tolist() == [7]
+    areas = draw_masked_fraction(stamps, torch.full((10,), 0.5)).axes[0].collections[0].get_paths()
+    assert [area.vertices[:, 0].max() for area in areas] == [9, 19]
+
+
 def test_cells_of_regular_frames_touch() -> None:
     edges, cells = frame_cells([0.0], np.array([[7.0]]))
     assert edges.tolist() == [-0.5, 0.5] and cells.tolist() == [[7.0]]

@@ -18,7 +18,8 @@ from v3d_torch.evaluation.ate import absolute_errors
 from v3d_torch.evaluation.rpe import motion_errors
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.time_axes import frame_cells, make_time_axes
-from v3d_torch.viz.trajectory_figure import insert_gaps, within
+from v3d_torch.viz.time_gaps import insert_gaps
+from v3d_torch.viz.trajectory_figure import within
 
 STATUS_COLOURS = {"tracked": "#1b6fb3", "odometry": "#7ab8d9", "disconnected": "#f2a900", "lost": "#d1341b"}
 """Colour of each tracking status, which colour-blind people can tell apart, too."""
@@ -121,7 +122,8 @@ def draw_masked_fraction(stamps: Tensor, fractions: Tensor) -> Figure:
     """
     seconds = (stamps - stamps[0]).tolist()
     figure, (axes,) = make_time_axes(seconds, [1.2])
-    axes.fill_between(seconds, 100 * fractions, color="tab:purple", alpha=0.5, linewidth=0, step="mid")
+    times, percent = insert_gaps(stamps, torch.stack([stamps - stamps[0], 100 * fractions], dim=1)).T
+    axes.fill_between(times, percent, color="tab:purple", alpha=0.5, linewidth=0, step="mid")
     axes.set(ylabel="masked [%]", ylim=(0, 100))
     return figure
 

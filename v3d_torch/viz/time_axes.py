@@ -10,6 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from v3d_torch.viz.time_gaps import find_gaps
+
 WIDTH = 9.0
 """Width of all plots of a report, inches."""
 
@@ -36,9 +38,9 @@ def make_time_axes(
 
 
 def frame_cells(seconds: Sequence[float], grid: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Arrange the values of frames as cells for `Axes.pcolormesh`. Times without frames are empty.
+    """Arrange the values of frames as cells for `Axes.pcolormesh`. Gaps are empty.
 
-    A cell ends halfway to the next frame, or one median interval after its frame if that is sooner.
+    A cell ends halfway to the next frame, or one median interval after its frame if a gap follows.
 
     Args:
         seconds: Time of each frame, increasing.
@@ -50,8 +52,8 @@ def frame_cells(seconds: Sequence[float], grid: NDArray[np.float64]) -> tuple[ND
     times = np.asarray(seconds, np.float64)
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     middles = (times[1:] + times[:-1]) / 2
-    starts = np.concatenate([[times[0] - step / 2], np.maximum(middles, times[1:] - step)])
-    ends = np.concatenate([np.minimum(middles, times[:-1] + step), [times[-1] + step / 2]])
-    before_gap = np.nonzero(ends[:-1] < starts[1:])[0]
-    edges = np.insert(np.append(starts, ends[-1]), before_gap + 1, ends[before_gap])
-    return edges, np.insert(grid, before_gap + 1, np.nan, axis=1)
+    edges = np.concatenate([[times[0] - step / 2], middles, [times[-1] + step / 2]])
+    after_gap = find_gaps(times)
+    edges[after_gap] = times[after_gap] - step
+    edges = np.insert(edges, after_gap, times[after_gap - 1] + step)
+    return edges, np.insert(grid, after_gap, np.nan, axis=1)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
@@ -20,10 +19,10 @@ from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.fonts import draw_title
+from v3d_torch.viz.time_gaps import insert_gaps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from numpy.typing import NDArray
 
 _MIN_HALF_RANGE = 0.01
 """Minimum half width of the view, metres, so that the pose noise of a static camera does not fill the figure."""
@@ -33,9 +32,6 @@ _MARGIN = 1.1
 
 _GUESSED = ("disconnected", "lost")
 """Tracking statuses of poses that were not measured relative to the map."""
-
-_GAP_FACTOR = 10
-"""A curve is interrupted where two stamps are farther apart than this multiple of the median interval."""
 
 
 def save_trajectory_figure(
@@ -119,23 +115,6 @@ def within(groundtruth: Trajectory, estimate: Trajectory) -> Trajectory:
     first, last = estimate.stamps[0] - MAX_TIME_DIFFERENCE, estimate.stamps[-1] + MAX_TIME_DIFFERENCE
     rows = (groundtruth.stamps >= first) & (groundtruth.stamps <= last)
     return Trajectory(groundtruth.stamps[rows], groundtruth.T_wc[rows])
-
-
-def insert_gaps(stamps: Tensor, points: Tensor) -> NDArray[np.float64]:
-    """Insert a NaN into a curve wherever poses are missing, so that it is drawn with a gap.
-
-    Args:
-        stamps: Timestamps, seconds, increasing, shape :math:`(N,)`.
-        points: Points of the curve, shape :math:`(N, 2)`.
-
-    Returns:
-        Points with the NaNs, shape :math:`(N + G, 2)`.
-    """
-    if len(stamps) < 2:
-        return points.numpy()
-    intervals = stamps.diff()
-    after = (intervals > _GAP_FACTOR * intervals.median()).nonzero()[:, 0].numpy() + 1
-    return np.insert(points.numpy(), after, np.nan, axis=0)
 
 
 def _separate_guesses(points: Tensor, statuses: Sequence[str]) -> tuple[Tensor, Tensor]:
