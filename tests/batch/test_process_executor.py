@@ -12,7 +12,7 @@ from threading import Event
 import pytest
 from helpers.batches import plan_seeds, repeat_sequence
 
-from v3d_torch.batch.executor import JobFinished
+from v3d_torch.batch.executor import JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.process_executor import ProcessExecutor
 
 
@@ -40,6 +40,26 @@ def test_death_of_a_process_fails_only_its_job_and_is_in_its_log(moment: Path, t
     assert planned[0].earlier_outcome() is None
     outcome = planned[1].earlier_outcome()
     assert outcome is not None and outcome.metrics["tracked"] == 20
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links on Windows need special permissions")
+def test_log_of_a_job_never_follows_a_link(moment: Path, tmp_path: Path) -> None:
+    """Neither with the traceback of a crash, nor with the reason of the death of a process."""
+    (job,) = plan_seeds(repeat_sequence(moment, tmp_path / "long", frames=20), tmp_path / "out", seeds=1)
+    job.folder.mkdir(parents=True)
+    own, log = tmp_path / "notes.txt", job.folder / "run.log"
+    own.write_text("own notes")
+    log.symlink_to(own)
+    for event in ProcessExecutor(1)([job], Event()):
+        if isinstance(event, JobProgress) and event.frames == 2:
+            (process,) = (child for child in multiprocessing.active_children() if child.name == str(job))
+            assert process.pid is not None
+            os.kill(process.pid, signal.SIGSEGV)
+    assert "Segmentation fault" in log.read_text() and own.read_text() == "own notes"
+    log.unlink()
+    log.symlink_to(own)
+    report_lost_process(job, "its machine died")
+    assert log.read_text().endswith("ERROR its machine died\n") and own.read_text() == "own notes"
 
 
 def test_jobs_run_where_the_path_of_the_temporary_folder_is_long(

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
+from v3d_torch.runs.log import remove_link
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
@@ -32,6 +33,9 @@ _MAX_SOCKET_PATH = 103
 
 _SOCKET_NAME = "/pymp-01234567/listener-01234567"
 """Form of the path of a fork server's socket in the temporary folder."""
+
+_NO_LINKS: int = getattr(os, "O_NOFOLLOW", 0)
+"""Flag of files that are opened without following a link; Windows has none."""
 
 
 class ProcessExecutor:
@@ -145,7 +149,8 @@ def _redirect_output(path: Path) -> None:
     """Append the output of libraries and the traceback of a crash to the log, so that the bars stay readable."""
     with suppress(OSError):  # `run_job` reports a folder that is not writable
         path.parent.mkdir(parents=True, exist_ok=True)
-        log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+        remove_link(path)
+        log = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | _NO_LINKS, 0o666)
         os.dup2(log, 1)
         os.dup2(log, 2)
         os.close(log)

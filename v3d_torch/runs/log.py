@@ -26,9 +26,8 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
         OutputError: If the file cannot be written.
     """
     try:
+        remove_link(path)
         if not append:
-            if path.is_symlink():  # to a file that is not of a run, and stays as it is
-                path.unlink()
             path.write_text("")  # not replaced, because the output of a batch's process already goes to the file
         # Append mode: if the interpreter crashes, faulthandler can write its report to the same file.
         handler = _LogFile(path, mode="a", encoding="utf-8", errors="backslashreplace")
@@ -46,6 +45,16 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
     finally:
         _LOG.removeHandler(handler)
         handler.close()
+
+
+def remove_link(path: Path) -> None:
+    """Remove a link in the place of a log. The file to which it leads is not of a run, and stays as it is.
+
+    Raises:
+        OSError: If the folder cannot be written.
+    """
+    if path.is_symlink():
+        path.unlink()
 
 
 @contextmanager
