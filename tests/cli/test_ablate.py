@@ -25,6 +25,7 @@ from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.result_folder import lock_results
 from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 
@@ -94,6 +95,13 @@ def test_every_run_writes_results_and_configuration_of_its_variant(done: tuple[P
         for name in ("trajectory.txt", "metrics.json", "dynamics.parquet", "run.log", "figures/trajectory.png"):
             assert (folder / name).is_file()
         assert load_config(folder / "config.yaml") == load_config(CONFIGS[variant])
+
+
+def test_folder_to_which_another_study_writes_is_error(sequence: Path, tmp_path: Path) -> None:
+    with lock_results(tmp_path):
+        result = call("--seq", sequence, "--variants", "baseline", "--seeds", "1", "--out", tmp_path)
+        assert_error_line(result, f"{tmp_path}: another run or batch is writing to this folder")
+        assert [path.name for path in tmp_path.iterdir()] == [".run.lock"]
 
 
 def test_csv_matches_metrics_of_runs(done: tuple[Path, str]) -> None:

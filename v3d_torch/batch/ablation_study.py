@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.request import RunRequest
-from v3d_torch.runs.result_folder import make_result_folder
+from v3d_torch.runs.result_folder import lock_results, make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_instance_source, make_segmenter, wrap_upright
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
@@ -83,8 +83,8 @@ def run_ablation_study(
     """Run the study, show and write its tables; arguments as in ``v3d-torch ablate --help``.
 
     Raises:
-        V3DError: If the input is invalid, if the folder contains an earlier study, if the study was interrupted, or if
-            a run failed. The results of the other runs are written.
+        V3DError: If the input is invalid, if the folder contains an earlier study or another study writes to it, if the
+            study was interrupted, or if a run failed. The results of the other runs are written.
     """
     console = wide_console()
     configs = {
@@ -101,6 +101,22 @@ def run_ablation_study(
         else:
             make_segmenter(config, camera)
     folder = make_result_folder(out, "ablation")
+    with lock_results(folder):
+        outcomes = _run_variants(folder, sequences, configs, network, console)
+    console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
+    print_line(console, f"results: {folder}")
+    if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
+        raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
+
+
+def _run_variants(
+    folder: Path,
+    sequences: Mapping[str, RGBDSequence],
+    configs: Mapping[tuple[str, int], Config],
+    network: Callable[[SegmentationConfig], Segmenter],
+    console: Console,
+) -> list[Outcome]:
+    """Run each configuration, given by variant and seed, on each sequence; write the tables after each run."""
     if (folder / _TABLE).exists():
         raise InputError(f"{folder}: contains an earlier study; choose another folder with --out")
     outcomes: list[Outcome] = []
@@ -123,10 +139,7 @@ def run_ablation_study(
     except KeyboardInterrupt as interrupt:
         done, total = len(outcomes), len(configs) * len(sequences)
         raise InputError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
-    console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
-    print_line(console, f"results: {folder}")
-    if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
-        raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
+    return outcomes
 
 
 def _find_variant(name: str) -> Path:
