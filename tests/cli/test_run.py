@@ -110,11 +110,14 @@ def test_every_file_of_a_run_is_removed_before_the_next_one(sequence: Path, tmp_
 
 
 def test_folder_to_which_another_run_writes_is_an_error_and_stays(sequence: Path, tmp_path: Path) -> None:
+    """No recording is created either: the same command would be refused once more when the other run has ended."""
     with lock_results(tmp_path / "out"):
         for name in ("run.log", "metrics.json"):
             (tmp_path / "out" / name).write_text("of the other run")
-        done = call_here("--seq", sequence, "--segmenter", "none", "--out", "out", cwd=tmp_path)
+        arguments = ("--seq", sequence, "--segmenter", "none", "--out", "out", "--rerun", "run.rrd")
+        done = call_here(*arguments, cwd=tmp_path)
         assert_error_line(done, "out: another run or batch is writing to this folder")
+        assert not (tmp_path / "run.rrd").exists()
         assert {(tmp_path / "out" / name).read_text() for name in ("run.log", "metrics.json")} == {"of the other run"}
 
 
