@@ -126,6 +126,26 @@ def test_measured_gravity_gives_the_up_direction_from_the_first_frame_on(start: 
     assert len(network.sizes) == 5
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_gravity_in_any_orientation_of_the_camera_gives_the_up_direction_of_the_world(seed: int) -> None:
+    twist, up = 2 * torch.randn(2, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    T_cw, up = se3_exp(twist), torch.nn.functional.normalize(up[:3], dim=0)
+    upright = UprightSegmenter(Network())
+    upright.segment_with_pose(replace(make_frame(0, 0), gravity=-T_cw[:3, :3] @ up), T_cw)
+    votes = up_votes(upright.state_dict())
+    assert votes is not None
+    torch.testing.assert_close(votes / votes.norm(), up)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_searches_of_a_rolled_camera_vote_for_the_up_direction_of_the_world(turns: int) -> None:
+    upright = UprightSegmenter(Network(confident=1.0, doubtful=0.0))
+    for index in range(8):  # three searches, each with a vote of weight 1 for the upright turn
+        upright.segment_with_pose(make_frame(index, turns), rolled(-90.0 * turns))
+    expected = torch.tensor([0.0, -3.5, 0.0], dtype=torch.float64)  # with the prior
+    torch.testing.assert_close(up_votes(upright.state_dict()), expected)
+
+
 def test_frames_with_gravity_are_never_searched() -> None:
     network = Network(doubtful=0.0)
     upright, gravity = UprightSegmenter(network), torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
