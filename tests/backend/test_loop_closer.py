@@ -202,6 +202,19 @@ def test_loop_correction_keeps_landmark_reprojection() -> None:
     assert error[own].max() < 1e-6
 
 
+def test_loop_correction_is_as_accurate_after_both_ends_of_an_earlier_loop_were_culled(closed: Camera) -> None:
+    camera, room = Camera(), Room(seed=1)
+    for k in range(2 * LAP):
+        camera.step(room, lap_pose(k))
+        if k == 40:
+            (_, end), (begin, _) = ((loop.i, loop.j) for loop in camera.map.loops)
+            references = {begin: begin + 1, end: end + 2, 15: 14}
+            camera.map.cull_keyframes(references)
+            camera.loop_closer.remove_keyframes(references)
+    assert camera.loop_closer.loop_count == closed.loop_closer.loop_count == 3
+    assert camera.errors().max() < 1.2 * closed.errors().max()
+
+
 def test_convention_correction_maps_old_world_to_new_world() -> None:
     camera, room = Camera(), Room(seed=1)
     # Without loop closing, the newest keyframe keeps the pose that it had before the correction.
