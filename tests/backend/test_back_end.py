@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import gc
 import threading
 import time
@@ -169,6 +170,20 @@ def test_back_end_that_loads_a_state_gives_the_pending_result(in_background: boo
     assert expected.adjustment is not None and result.adjustment is not None
     assert torch.equal(result.adjustment.T_cw, expected.adjustment.T_cw)
     assert torch.equal(result.adjustment.points, expected.adjustment.points)
+
+
+def test_places_after_the_pending_result_of_a_loaded_state_equal_those_without_interruption(demo: RGBDSequence) -> None:
+    slam, loaded = (V3DSLAM(demo.camera, config=make_config(in_background=False)) for _ in range(2))
+    for index in range(5):
+        slam(demo[index])
+    loaded.load_state_dict(copy.deepcopy(slam.state_dict()))
+    places = []
+    for each in (slam, loaded):
+        each.flush()
+        place = each.loop_closer.relocalise(each.map.keyframes[-1].features, each.map)
+        assert place is not None
+        places.append((place.keyframe.index, place.tracking.T_cw.tolist()))
+    assert places[0] == places[1]
 
 
 class ImmediateExecutor:

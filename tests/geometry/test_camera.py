@@ -104,6 +104,28 @@ def test_camera_that_is_first_used_in_inference_mode_has_gradients(camera: Pinho
     assert not any(value.is_inference() for value in vars(camera).values() if isinstance(value, torch.Tensor))
 
 
+@pytest.mark.parametrize("offset", [0.02, -0.02])
+def test_offset_is_added_to_the_measured_inverse_depth(offset: float) -> None:
+    depth = torch.tensor([0.5, 2.0, 8.0, 40.0], dtype=torch.float64)
+    corrected = replace(FR3, inverse_depth_offset=offset).correct_depth(depth)
+    torch.testing.assert_close(1 / corrected, 1 / depth + offset)
+
+
+def test_missing_depth_and_depth_that_an_offset_makes_infinite_are_missing() -> None:
+    depth = torch.tensor([0.0, 31.0, 32.0, 33.0])
+    assert (replace(FR3, inverse_depth_offset=-1 / 32).correct_depth(depth) > 0).tolist() == [False, True, False, False]
+    assert replace(FR3, inverse_depth_offset=1 / 32).correct_depth(depth)[0] == 0
+
+
+def test_image_ends_half_a_pixel_beyond_its_outermost_pixel_centres() -> None:
+    inside = torch.tensor([[-0.4, -0.4], [639.4, 479.4]], dtype=torch.float64)
+    outside = torch.tensor([[-0.6, 9], [9, -0.6], [639.6, 9], [9, 479.6]], dtype=torch.float64)
+    uv = torch.cat([inside, outside])
+    pixels, in_image = FR3.project_to_image(FR3.back_project(uv, torch.full((6,), 2.0, dtype=torch.float64)), 0.1)
+    assert in_image.tolist() == [True, True, False, False, False, False]
+    torch.testing.assert_close(pixels[:2], inside)
+
+
 def test_camera_accepts_numpy_and_torch_numbers() -> None:
     K = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
     distortion = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera returns it

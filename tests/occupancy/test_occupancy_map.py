@@ -243,6 +243,19 @@ def test_distances_follow_the_map() -> None:
     assert occupancy.distance(point) < before - 0.3
 
 
+@pytest.mark.parametrize("change", ["replace_blocks", "load_state_dict"])
+def test_distances_follow_a_replaced_content(change: str) -> None:
+    row = box_of_voxels((0, 0, 0), (12, 1, 1))
+    occupancy, other = map_of(row[:1], row[1:]), map_of(row[9:], row[:9])
+    points = (row + 0.5) * SIZE
+    assert not torch.equal(occupancy.distance(points), other.distance(points))
+    if change == "replace_blocks":
+        occupancy.replace_blocks(other.blocks)
+    else:
+        occupancy.load_state_dict(other.state_dict())
+    assert torch.equal(occupancy.distance(points), other.distance(points))
+
+
 def test_depth_beyond_the_range_of_stored_views_shows_the_same_free_space() -> None:
     maps = [OccupancyMap(CONFIG) for _ in range(2)]
     for occupancy, depth in zip(maps, (12.0, 20.0), strict=True):

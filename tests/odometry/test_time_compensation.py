@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -53,6 +54,14 @@ def test_time_compensation_equals_rolling_shutter_after_depth_delay(features: Fe
     delayed = compensate_depth_delay(features, depth, VELOCITY, DELAY)
     assert_equal(compensated, compensate_rolling_shutter(delayed, VELOCITY, KINECT))
     assert not torch.equal(compensated.uv, features.uv) and not torch.equal(compensated.depth, features.depth)
+
+
+def test_delay_of_the_camera_is_added_to_that_of_the_timestamps(features: Features, depth: Tensor) -> None:
+    of_delayed_camera = TimeCompensation(Config(), replace(CAMERA, depth_delay=0.006))
+    compensated = of_delayed_camera(features, depth, 0.014, VELOCITY, KINECT)
+    expected = compensate(features, depth, 0.02, VELOCITY, KINECT)
+    torch.testing.assert_close(compensated.depth, expected.depth)
+    torch.testing.assert_close(compensated.uv, expected.uv)
 
 
 def test_rolling_shutter_is_compensated_with_the_depth_of_the_colour_image(features: Features, depth: Tensor) -> None:
