@@ -30,8 +30,6 @@ class PoseKalmanFilter:
         T_wc: Filtered camera-to-world pose, float64, shape :math:`(4, 4)`.
         twist: Filtered twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
         covariance: Covariance of the errors of pose and twist, float64, shape :math:`(12, 12)`.
-        cross_covariance: Cross-covariance of the errors of the last measured pose (rows) and of the twist (columns),
-            float64, shape :math:`(6, 6)`.
     """
 
     def __init__(self) -> None:
@@ -41,6 +39,15 @@ class PoseKalmanFilter:
     def is_started(self) -> bool:
         """True once `start` was called."""
         return not math.isnan(self.stamp)
+
+    @property
+    def cross_covariance(self) -> Tensor:
+        """Cross-covariance of the errors of pose (rows) and twist (columns), float64, shape :math:`(6, 6)`.
+
+        It is the same for the filtered pose and for the last measured one: with the covariances P of the prediction, R
+        of the measurement and S of the innovation, both are ``R @ S^-1 @ P[:6, 6:]``.
+        """
+        return self.covariance[:6, 6:]
 
     def start(self, stamp: float, T_wc: Tensor, covariance: Tensor, twist: Tensor | None = None) -> None:
         """Reset the state to a measured pose.
@@ -55,13 +62,11 @@ class PoseKalmanFilter:
         self.T_wc = T_wc
         self.twist = torch.zeros(6, dtype=torch.float64) if twist is None else twist
         self.covariance = torch.block_diag(covariance, _TWIST_COVARIANCE)
-        self.cross_covariance = torch.zeros(6, 6, dtype=torch.float64)
 
     def predict(self, stamp: float) -> None:
         """Predict the state at a later time, seconds."""
         elapsed = stamp - self.stamp
         self.covariance = predict_covariance(self.covariance, self.twist, elapsed)
-        self.cross_covariance = self.covariance[:6, 6:]
         self.stamp, self.T_wc = stamp, orthonormalise(self.T_wc @ se3_exp(self.twist * elapsed))
 
     def update(self, T_wc: Tensor, covariance: Tensor) -> None:
@@ -79,7 +84,6 @@ class PoseKalmanFilter:
         kept = torch.eye(12, dtype=torch.float64)  # Joseph form, which stays symmetric and positive definite
         kept[:, :6] -= gain
         self.covariance = kept @ P @ kept.T + gain @ covariance @ gain.T
-        self.cross_covariance = covariance @ gain[6:].T
 
     def stop(self) -> None:
         """Set the twist to zero, and add its former value to the uncertainty."""
