@@ -105,6 +105,26 @@ def test_interpolated_covariance_is_an_upper_bound(fraction: float, seed: int) -
     assert torch.linalg.eigvalsh(got - root @ root.T).min() > -1e-9
 
 
+@pytest.mark.parametrize("end", [0, 1])
+def test_error_of_a_frame_turns_with_the_camera_between_frames(end: int) -> None:
+    """Along the interpolated path the error of either frame is rigidly attached to the camera there."""
+    poses = START, START @ se3_exp(torch.tensor([0.3, -0.5, 0.1, 0.4, -0.2, 0.3], dtype=torch.float64))
+    covariance, fraction = torch.arange(1.0, 7.0).double().diag(), 0.4
+    between = []
+    for uncertain in (covariance, 0 * covariance):
+        states = StateHistory()
+        for index, T_wc in enumerate(poses):
+            own = uncertain if index == end else 0 * covariance
+            states.append(replace(state(0.2 * index, T_wc), covariance=own))
+        between.append(states.at(0.2 * fraction))
+    to_end = invert(poses[end]) @ between[0].T_wc
+    jacobian = torch.autograd.functional.jacobian(
+        lambda error: se3_log(invert(to_end) @ se3_exp(error) @ to_end), torch.zeros(6, dtype=torch.float64)
+    )
+    expected = (1 - fraction, fraction)[end] * jacobian @ covariance @ jacobian.T
+    torch.testing.assert_close(between[0].covariance - between[1].covariance, expected)
+
+
 def test_covariance_between_frames_covers_motions_of_a_hand() -> None:
     """Paths of white acceleration noise, whose ends are known, have the covariance at a time between (Monte Carlo)."""
     generator = torch.Generator().manual_seed(0)
