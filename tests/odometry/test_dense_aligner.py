@@ -125,6 +125,21 @@ def test_alignment_is_deterministic_for_any_number_of_threads() -> None:
         assert first._replace(T_ba=0, information=0) == other._replace(T_ba=0, information=0)
 
 
+def test_information_is_that_of_errors_in_the_current_camera() -> None:
+    """Motion along the stripes of a wall is unobservable; they have another direction for a camera that is rolled."""
+    roll = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, torch.pi / 4], dtype=torch.float64))
+    a, b = (render(T_cw, planes=WALL, paint=vertical_stripes) for T_cw in (IDENTITY, roll))
+    information = align_depth(*a, *b, LENS, roll, config=DenseOdometryConfig(halvings=(3,))).information[:3, :3]
+    across, along, _ = roll[:3, :3].T
+    assert (along @ information @ along).abs() < 1e-2 * (across @ information @ across)
+
+
+def test_occluded_points_are_no_inliers() -> None:
+    b, _ = add_walker(A, 200)
+    found = align_depth(*A, *b, LENS, config=DenseOdometryConfig(halvings=(2,)))
+    assert float(found.inlier_ratio) == pytest.approx(1 - 220 / 640, abs=0.01)
+
+
 # ---------------------------------------------------------------------------------------------- rejection
 
 
