@@ -8,7 +8,7 @@ import torch
 from helpers.sparse_maps import CAMERA, EYE
 from helpers.sparse_maps import features as random_features
 from helpers.sparse_maps import make_map as make_empty_map
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -20,6 +20,8 @@ from v3d_torch.mapping.sparse_map import SparseMap
 
 LANDMARKS = 20
 LEVELS = Config().features.levels
+ALL = dict.fromkeys(range(LANDMARKS), 0)
+ALL_COARSER = dict.fromkeys(range(LANDMARKS), 1)
 
 Observed = dict[int, int]
 """Landmarks that a keyframe observes, with the octave of each."""
@@ -86,6 +88,8 @@ OBSERVED = st.lists(
 
 @settings(max_examples=80)
 @given(OBSERVED, st.sampled_from([0.3, 0.5, 0.9]), st.integers(1, 4))
+@example([ALL], 0.9, 1)  # the first keyframe is redundant, and stays
+@example([ALL, ALL_COARSER], 0.9, 2)  # a view at the next octave counts
 def test_culled_keyframes_equal_a_plain_count(observed: list[Observed], ratio: float, views: int) -> None:
     culled = cull(make_map(observed), redundant_ratio=ratio, redundant_views=views)
     assert culled == count_redundant(observed, ratio, views)
@@ -139,6 +143,13 @@ def test_culled_keyframes_and_their_landmarks_move_with_the_reference_keyframe()
     assert [keyframe.reference for keyframe in sparse_map.keyframes] == [0, 4, 4, 3, 4]
 
 
+def test_reference_of_a_culled_keyframe_is_active_if_both_are_culled_at_once() -> None:
+    """Keyframe 2 moves with 1, which observes all of its landmarks, but 1 is culled next and moves with 0."""
+    sparse_map = make_map([dict.fromkeys(range(count), 0) for count in (12, 10, 5)])
+    assert cull(sparse_map, redundant_views=1) == {1, 2}
+    assert [keyframe.reference for keyframe in sparse_map.keyframes] == [0, 0, 0, 3]
+
+
 def test_consecutive_active_keyframes_are_connected_across_culled_ones() -> None:
     sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(5)])
     sparse_map.cull_keyframes({1: 0, 2: 0, 4: 5})
@@ -171,3 +182,7 @@ def test_landmarks_without_a_second_observation_are_culled_after_three_keyframes
     insert(sparse_map, {})
     sparse_map.cull_landmarks()
     assert sparse_map.landmarks["active"].tolist() == [False, True, False]
+    sparse_map.remove_observations(torch.nonzero(sparse_map.observations["keyframe"] > 0)[:, 0])
+    insert(sparse_map, {})
+    sparse_map.cull_landmarks()
+    assert sparse_map.landmarks["active"][1]  # it was confirmed

@@ -100,6 +100,16 @@ def test_adjustment_moves_only_the_keyframes_of_its_window() -> None:
     assert moved == [False] * 8 + [True] * 4
 
 
+def test_first_keyframe_stays_in_a_window_that_other_keyframes_fix() -> None:
+    walk = Walk(keyframes=6, error=0.01)
+    before = walk.map.T_cw
+    config = load_config(overrides=["mapping.bundle_keyframes=3"])
+    adjustment = local_bundle_adjust(walk.map, walk.map.keyframes[1], config, CAMERA)
+    assert adjustment is not None
+    moved = (adjustment.T_cw != before).flatten(1).any(dim=1)
+    assert moved.tolist() == [False, True, True, False, False, False]
+
+
 def test_adjustment_is_disabled_without_bundle_keyframes() -> None:
     walk = Walk(keyframes=4, error=0.01)
     config = load_config(overrides=["mapping.bundle_keyframes=0"])
