@@ -30,11 +30,15 @@ def depth_of(*surfaces: tuple[slice, slice, float]) -> Tensor:
     return depth
 
 
-def refine(depth: Tensor, appeared: Tensor | None = None, *, missed: bool = False, **mask: float) -> Tensor:
-    """Return the refined mask of the body; the mask of the network has the upper part only."""
+def refine(
+    depth: Tensor, appeared: Tensor | None = None, *, missed: bool = False, cloud_end: int = CUT, **mask: float
+) -> Tensor:
+    """Return the refined mask of the body; the mask of the network has the upper part only, the cloud can have more."""
     segmented = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     segmented[ROWS.start : CUT, COLUMNS] = True
-    cloud = (CAMERA.rays * depth[0][..., None])[segmented & (depth[0] > 0)][::5]
+    seen = torch.zeros_like(segmented)
+    seen[ROWS.start : cloud_end, COLUMNS] = True
+    cloud = (CAMERA.rays * depth[0][..., None])[seen & (depth[0] > 0)][::5]
     track = Track(1, 0.0, TrackerConfig(), segmented, segmented & (depth[0] > 0), pack_masks(segmented), missed=missed)
     track.add_detection(Detection3D(0.0, cloud.mean(dim=0).to(torch.float64), cloud))
     if appeared is None:
@@ -55,6 +59,23 @@ def test_surface_margin_limits_the_growth() -> None:
     for margin in (16, 32, 48):
         assert abs(rows_below_cut(refine(depth_of(), surface_margin=margin)) - margin - spacing) <= 2 * STEP
     assert rows_below_cut(refine(depth_of(), surface_margin=0, depth_margin=8)) <= 8
+
+
+def test_surface_margin_counts_from_the_mask_also_if_the_cloud_is_larger() -> None:
+    for margin in (16, 32):
+        assert abs(rows_below_cut(refine(depth_of(), surface_margin=margin, cloud_end=ROWS.stop)) - margin) <= 2 * STEP
+
+
+def test_depth_tolerance_grows_with_the_square_of_depth() -> None:
+    """At 2 m, the tolerance of 5 cm grows by 4 cm."""
+    for distance, rows in ((-0.1, 0), (-0.08, 8), (0.08, 8), (0.1, 0)):
+        board = (slice(CUT, ROWS.stop), COLUMNS, BODY + distance)
+        assert rows_below_cut(refine(depth_of(board), surface_margin=0, depth_margin=8, depth_tolerance=0.05)) == rows
+
+
+def test_missing_depth_around_the_mask_is_included() -> None:
+    hole = (slice(CUT, ROWS.stop), COLUMNS, 0.0)
+    assert rows_below_cut(refine(depth_of(hole), surface_margin=0, depth_margin=8)) == 8
 
 
 def test_wall_behind_the_body_is_excluded() -> None:
@@ -100,10 +121,14 @@ def test_mask_of_a_missed_object_grows() -> None:
 
 
 def test_concave_edge_ends_the_growth() -> None:
-    """The body stands behind the edge of a table, whose near side lies within the depth tolerance: no depth edge."""
-    depth = depth_of()
-    slope = torch.arange(40) * 0.004  # of the inverse depth of a plane, 1/m per pixel
-    depth[0, 160:200, COLUMNS] = (1 / (1 / BODY + slope))[:, None]
-    lenient = {"surface_margin": 100.0, "depth_tolerance": 1.0, "edge_ratio": 0.1}
-    assert rows_below_cut(refine(depth, **lenient)) <= 160 - CUT + STEP
+    """The body stands behind the edge of a table, whose near side lies within the depth tolerance: no depth edge.
+
+    The edge is below the mask, or within it.
+    """
+    lenient = {"surface_margin": 100.0, "depth_margin": 0.0, "depth_tolerance": 1.0, "edge_ratio": 0.1}
+    for edge in (160, 128):
+        depth = depth_of()
+        slope = torch.arange(ROWS.stop - edge) * 0.004  # of the inverse depth of a plane, 1/m per pixel
+        depth[0, edge : ROWS.stop, COLUMNS] = (1 / (1 / BODY + slope))[:, None]
+        assert rows_below_cut(refine(depth, **lenient)) <= max(edge - CUT, 0) + STEP
     assert rows_below_cut(refine(depth_of(), **lenient)) == ROWS.stop - CUT
