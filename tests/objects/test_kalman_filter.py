@@ -75,7 +75,7 @@ def test_kalman_filter_limits_the_speed() -> None:
 def test_covariance_of_the_filter_is_that_of_its_errors() -> None:
     """Monte Carlo: walks with white acceleration noise and a changing visible part; 500 whitened errors."""
     generator, config = np.random.default_rng(0), TrackerConfig(max_speed=1e6, acceleration_noise=2.0)
-    dt, squared, squared_visible = 0.1, [], []
+    dt, squared, of_visible = 0.1, [], []
     noise = 2.0**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
     step, correlation = np.linalg.cholesky(noise), math.exp(-dt / 2.0)
     sigmas = [0.3, 0.2, *[0.05] * 6, 0.1, 0.2, 0.3, *[0.1] * 4]  # enters the image, and walks behind a table
@@ -86,17 +86,20 @@ def test_covariance_of_the_filter_is_that_of_its_errors() -> None:
             fast = math.sqrt(1 - SLOW) * generator.normal(size=3)
             seen = position + sigma * (math.sqrt(SLOW) * part + fast)
             motion.update(k * dt, torch.from_numpy(seen + NOISE * generator.normal(size=3)), sigma)
-            change = step @ generator.normal(size=(2, 3))
+            moving, change = velocity, step @ generator.normal(size=(2, 3))
             position, velocity = position + dt * velocity + change[0], velocity + change[1]
             part = correlation * part + math.sqrt(1 - correlation**2) * generator.normal(size=3)
         predicted = motion.state.predict(len(sigmas) * dt)
         error = np.concatenate([predicted.position.numpy() - position, predicted.velocity.numpy() - velocity])
         squared.append(error @ np.linalg.solve(predicted.covariance.numpy(), error))
-        error = motion.visible_state.position.numpy() - seen
-        squared_visible.append(error @ error / motion.visible_state.variances[0])
-    for found, degrees in ((squared, 6), (squared_visible, 3)):
-        low, high = chi2.ppf([0.001, 0.999], degrees * len(found)) / len(found)
-        assert low < np.mean(found) < high
+        visible = motion.visible_state
+        of_visible.append(np.stack([visible.position.numpy() - seen, visible.velocity.numpy() - moving], axis=1))
+    low, high = chi2.ppf([0.001, 0.999], 6 * len(squared)) / len(squared)
+    assert low < np.mean(squared) < high
+    # Whitened errors of position and velocity of the visible part, on the three axes of all walks.
+    pp, pv, vv = visible.variances
+    whitened = np.linalg.solve(np.linalg.cholesky(np.array([[pp, pv], [pv, vv]])), np.concatenate(of_visible).T)
+    np.testing.assert_allclose(whitened @ whitened.T / 1500, np.eye(2), atol=3 * (2 / 1500) ** 0.5)
 
 
 def test_velocity_of_a_part_is_known_sooner_than_the_place_of_the_whole() -> None:

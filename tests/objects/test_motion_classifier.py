@@ -365,6 +365,15 @@ def test_dynamic_state_is_held_for_the_configured_time() -> None:
     assert ends[1] - ends[0] == pytest.approx(0.4, abs=1.01 / 15)  # one frame of rounding
 
 
+def test_chair_that_stopped_is_static_at_once_although_motion_over_a_longer_time_is_unknown() -> None:
+    """It was pushed for 0.8 s; no view is 5 s older than another."""
+    chair = walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0), stop=0.8, label=CHAIR)
+    overrides = ("objects.voting.time_spans=[0.0, 0.3]", "objects.free_space.time_spans=[0.3, 5.0]")
+    frames = simulate(*CHAIRS, chair, seconds=1.5, overrides=overrides)
+    dynamic = [frame.stamp for frame in frames if frame[4].motion_state is MotionState.DYNAMIC]
+    assert 0.8 <= dynamic[-1] < 0.8 + 0.4 + 1e-6
+
+
 def flashing(t: float) -> list[Box]:
     """Box with a wrong depth in a single frame."""
     return [((-0.2, 0.3, 2.5 if abs(t - 0.6) > 0.01 else 2.0), (0.5, 0.6, 0.5))]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.boards import CAMERA, CLOUDS, HERE, Board, BoardTracker, render
+from helpers.boards import CAMERA, CHAIR, CLOUDS, HERE, Board, BoardTracker, render
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE
@@ -88,3 +88,64 @@ def test_empty_place_is_no_evidence_against_the_return_of_a_lost_track() -> None
     track.add_vacancy(0.3, 0.3)
     assert track.vacancy < 0
     assert torch.equal(compare_without_masks([track], detected, TrackerConfig()), before)
+
+
+def test_evidence_of_an_empty_place_starts_anew_with_each_detection() -> None:
+    found = []
+    for was_vacant in (False, True):
+        track_boards = BoardTracker()
+        (track,) = track_boards(Board(0.0))
+        if was_vacant:
+            track.add_vacancy(0.02, 0.02)
+        track_boards(Board(0.0))
+        track.add_vacancy(0.04, 0.01)
+        found.append((track.vacant_time, track.vacancy))
+    assert found[0] == found[1] and found[0][1] < 0
+
+
+def test_lost_walker_is_expected_where_a_person_slows_down() -> None:
+    """A board where the decaying velocity leads is more likely the walker than one where constant velocity leads."""
+    track_boards = BoardTracker()
+    for frame in range(20):
+        (track,) = track_boards(Board(-1.0 + frame / 30))
+    stamp = track.newest.stamp + 0.4
+    expected, constant = (
+        float(state.position[0]) for state in (track.predict_return(stamp), track.predict_state(stamp))
+    )
+    assert constant - expected > 0.08
+    ratios = []
+    for x in (expected, constant):
+        depth, instances = render([Board(x)])
+        clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+        detected = detect_instances(stamp, instances, clouds, None, HERE, 1)
+        ratios.append(float(compare_without_masks([track], detected, TrackerConfig())))
+    assert ratios[0] > ratios[1]
+
+
+def test_empty_predicted_mask_is_no_evidence_against_an_instance() -> None:
+    """The points are visible, but none of them is at a pixel of the coarse mask."""
+    track_boards = BoardTracker()
+    for _ in range(3):
+        tracks = track_boards(Board(0.0))
+    depth, instances = render([Board(0.0)])
+    clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+    detected = detect_instances(0.1, instances, clouds, None, HERE, 1)
+    predicted = predict_tracks(tracks, 0.1, depth, HERE, CAMERA, CLOUDS, 1)
+    empty = replace(predicted, masks=torch.zeros_like(predicted.masks))
+    hidden = replace(empty, visible_fractions=torch.zeros_like(predicted.visible_fractions))
+    assert predicted.visible.all()
+    ratios = [compare_tracks(each, detected, TrackerConfig()) for each in (empty, hidden)]
+    assert torch.equal(*ratios) and ratios[0].isfinite().all()
+
+
+def test_state_of_the_visible_part_follows_its_centroid() -> None:
+    """A curtain hides the right half of a board: the centroid of the rest is 0.2 m to the left of the whole."""
+    track_boards = BoardTracker()
+    for boards in 10 * [(Board(0.0, width=0.8),)] + [(Board(0.0, width=0.8), Board(0.3, 1.5, 0.0, 0.6, 2.0, CHAIR))]:
+        track = track_boards(*boards)[0]
+    stamp = track.newest.stamp
+    assert float(track.newest.centroid[0]) < -0.15
+    visible, whole = (
+        each(stamp).position - track.newest.centroid for each in (track.predict_visible_state, track.predict_state)
+    )
+    assert visible.norm() < 0.03 < 0.1 < whole.norm()
