@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
 import torch
 from helpers.moving_camera import EYE, TWIST, Camera, frame_pose, twists, walk
 from hypothesis import given, settings
@@ -68,6 +69,18 @@ def test_velocity_of_a_lost_camera_follows_measured_motions() -> None:
     for k in range(2, 20):
         camera.append(0.1 * k, frame_pose(step @ camera.poses.T_cw, TrackingStatus.LOST), None, step)
         torch.testing.assert_close(camera.model.velocity, -TWIST, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("is_measured", "expected"), [(True, 1.5), (False, 2.0)])
+def test_velocity_at_a_frame_is_the_mean_of_the_measured_motions_before_and_after_it(
+    is_measured: bool, expected: float
+) -> None:
+    """The camera doubles its velocity in the frame."""
+    camera, before, after = Camera(), se3_exp(-0.1 * TWIST), se3_exp(-0.2 * TWIST)
+    camera.append(0.0, frame_pose(EYE), None)
+    camera.append(0.1, frame_pose(before), None, before if is_measured else None)
+    camera.append(0.2, frame_pose(after @ before), None, after)
+    torch.testing.assert_close(camera.previous_velocity, -expected * TWIST)
 
 
 def test_jump_of_a_relocalised_camera_is_not_a_velocity() -> None:

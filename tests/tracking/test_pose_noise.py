@@ -51,6 +51,8 @@ def test_windows_over_interruptions_do_not_count() -> None:
         noise.update(n / 30, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
     for n in range(40):  # one frame a second
         noise.update(10.0 + n, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
+    for n in range(40):  # five frames last for 0.4 s
+        noise.update(100.0 + n / 10, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
     assert torch.equal(noise.scale(NOMINAL), before)
 
 

@@ -138,6 +138,18 @@ def test_features_of_the_newest_keyframe_are_compensated_again_in_the_map() -> N
     assert torch.equal(keyframe.T_cw, T_cw) and torch.equal(scene.poses.T_cw, T_cw)  # left to the bundle adjustment
 
 
+def test_depth_of_the_newest_keyframe_is_compensated_again_by_its_delay() -> None:
+    scene, delay = Scene(), 0.02
+    keyframe = scene.map.insert_keyframe(1, 0.1, scene.poses.T_cw, scene.previous.features, scene.ids)
+    observed, depth = keyframe.features, scene.previous.depth
+    scene.refine(replace(scene.previous, frame=replace(scene.previous.frame, depth_delay=delay)))
+    expected, undelayed = (
+        scene.compensate(observed, depth, each, VELOCITY, scene.map.readout) for each in (delay, 0.0)
+    )
+    torch.testing.assert_close(keyframe.features.depth, expected.depth)
+    assert not torch.equal(expected.depth, undelayed.depth)
+
+
 def test_pose_stays_without_refinement_of_poses() -> None:
     scene = Scene()
     T_cw = scene.poses.T_cw
