@@ -393,6 +393,14 @@ def test_box_is_newly_occupied_over_each_time_span(rate: int) -> None:
         check.add_view(current, current.T_cw)
 
 
+def test_view_is_compared_with_the_newest_one_that_is_older_by_the_time_span() -> None:
+    """Stamps of the same time differ by rounding; a view that is half a frame too new is not meant."""
+    old = 0.1 + 0.2
+    assert old > 0.6 - 0.3
+    appeared = check_with(view(at=old), view(WITH_BOX, at=old + 0.015))(view(WITH_BOX, at=0.6)).appeared[0]
+    assert (box(appeared) == 1).all()
+
+
 def test_views_older_than_the_longest_time_span_are_dropped() -> None:
     check, stored, images = check_with(), [], []
     for frame in range(100):

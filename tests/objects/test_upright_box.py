@@ -56,6 +56,13 @@ def test_moving_box_points_where_it_moves(yaw: float, quarter: int, beside: floa
     torch.testing.assert_close(box.size[:2], torch.tensor(expected).double(), rtol=0.0, atol=1e-4)
 
 
+def test_object_that_moves_up_points_along_its_longer_side() -> None:
+    size, velocity = torch.tensor([1.0, 0.4, 1.5]).double(), torch.tensor([0.0, -0.2, 1.0]).double()
+    box = upright_box(cloud_of_box(torch.zeros(3).double(), size, 0.2), UP, R_LW.T @ velocity)
+    assert abs(box.yaw - 0.2) < 1e-3
+    torch.testing.assert_close(box.size, size, rtol=0.0, atol=1e-4)
+
+
 def test_single_point_has_a_box_without_volume() -> None:
     box = upright_box(torch.tensor([[1.0, 2.0, 3.0]]), UP, AT_REST)
     torch.testing.assert_close(box.T_wb[:3, 3], torch.tensor([1.0, 2.0, 3.0]).double(), rtol=0.0, atol=1e-5)
