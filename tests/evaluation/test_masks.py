@@ -113,6 +113,15 @@ def test_evaluation_without_frames_has_no_scores() -> None:
 # --- people in view, and the objects that cover them
 
 
+def test_people_in_view_fill_a_fraction_of_the_whole_image_also_where_depth_is_missing() -> None:
+    evaluation, truth, depth = MaskEvaluation(), torch.zeros(50, 40, dtype=torch.uint8), torch.zeros(1, 50, 40)
+    depth[:, :25] = 1.0
+    truth[0, :6], truth[1, :5] = 3, 4  # 0.3 % of the image are 6 pixels
+    evaluation.add(0.0, truth, depth, torch.zeros(50, 40, dtype=torch.bool), {})
+    scores = evaluation.compute_scores()
+    assert scores is not None and [person.id for person in scores.people] == [3]
+
+
 def test_people_in_view_have_enough_pixels_with_depth() -> None:
     truth = torch.zeros(4, 10, dtype=torch.uint8)
     truth[0], truth[1, :5], truth[2], truth[3] = 3, 4, 5, 255

@@ -64,6 +64,13 @@ def test_undistorted_mask_is_moved_with_the_image_and_excludes_what_was_not_reco
     assert not image.static[outside].any() and not image.frame.depth[0][outside].any()
 
 
+def test_undistorted_depth_has_only_measured_values() -> None:
+    """Between a surface and the one behind it there is none."""
+    image = posed_images(DISTORTED)[0]
+    measured, undistorted = (each.frame.depth.unique().tolist() for each in (image, Undistorter(DISTORTED)(image)))
+    assert set(undistorted) <= {0.0, *measured}
+
+
 def test_undistortion_of_pinhole_image_changes_nothing() -> None:
     for image in posed_images():
         same = Undistorter(CAMERA)(image)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.depth_units import depth_to_metres
+from v3d_torch.geometry.depth_units import depth_to_metres, implausible_median
 
 
 def test_convention_depth_in_metres_is_units_divided_by_the_depth_scale() -> None:
@@ -49,3 +49,11 @@ def test_result_does_not_share_memory() -> None:
 def test_whole_numbers_without_a_depth_scale_are_rejected() -> None:
     with pytest.raises(InputError, match="give the camera a depth_scale"):
         depth_to_metres(np.ones((2, 2), np.uint16), None)
+
+
+@pytest.mark.parametrize(
+    ("depth", "expected"),
+    [([0.0], None), ([0.04, 0.04, 9.0], 0.04), ([0.0, 0.0, 0.06], None), ([49.0], None), ([0.0, 51.0], 51.0)],
+)
+def test_median_of_the_measured_depth_shows_a_wrong_unit(depth: list[float], expected: float | None) -> None:
+    assert implausible_median(torch.tensor(depth)) == pytest.approx(expected)

@@ -14,6 +14,7 @@ from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_fusion import LandmarkFusion
+from v3d_torch.mapping.landmark_ids import merge_landmarks
 from v3d_torch.mapping.sparse_map import SparseMap
 
 POINTS = 120
@@ -172,3 +173,13 @@ def test_table_and_keyframes_agree_after_any_fusion(matches: list[list[int]], se
         matched[repeated | ~sparse_map.landmarks["active"][matched.clamp(min=0)]] = -1
         sparse_map.fuse_landmarks(sparse_map.keyframes[k % 4], matched)
         assert_consistent(sparse_map)
+
+
+def test_landmarks_are_merged_although_one_keyframe_had_a_wrong_observation_of_both() -> None:
+    sparse_map = make_map()
+    sparse_map.insert_keyframe(0, 0.0, EYE, features(2), torch.tensor([-1, -1]))
+    sparse_map.insert_keyframe(1, 0.1, EYE, features(1), torch.tensor([1]))
+    sparse_map.remove_observations(torch.tensor([1]))  # of landmark 1, by keyframe 0
+    merge_landmarks(sparse_map, torch.tensor([0]), torch.tensor([1]))
+    assert sparse_map.landmarks["active"].tolist() == [True, False]
+    assert [keyframe.landmarks.tolist() for keyframe in sparse_map.keyframes] == [[0, -1], [0]]

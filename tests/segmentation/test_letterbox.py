@@ -25,6 +25,12 @@ def test_window_covers_exactly_the_image_and_maps_back_to_its_edges(image_height
     )
 
 
+def test_boxes_are_clipped_at_the_border_of_the_image() -> None:
+    _, window = letterbox(torch.zeros(3, 60, 160, dtype=torch.uint8), 96, 128)
+    boxes = window.to_image(torch.tensor([[-5.0, 0.0, 64.0, 48.0], [64.0, 48.0, 140.0, 96.0]]))
+    torch.testing.assert_close(boxes, torch.tensor([[0.0, 0.0, 80.0, 30.0], [80.0, 30.0, 160.0, 60.0]]))
+
+
 def test_image_of_canvas_size_is_not_resampled() -> None:
     image = torch.randint(256, (3, 96, 128), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     canvas, window = letterbox(image, 96, 128)
