@@ -18,8 +18,6 @@ from v3d_torch.tracking.state_estimator import StateEstimator
 from v3d_torch.types import FramePose, TrackingStatus
 
 INFORMATION = 1e6 * torch.eye(6, dtype=torch.float64)
-
-
 REST = torch.zeros(6, dtype=torch.float64)
 CORRECTION = se3_exp(torch.tensor([2.0, -1.0, 3.0, 0.5, 1.2, -0.7], dtype=torch.float64))
 
