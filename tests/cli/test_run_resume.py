@@ -33,7 +33,9 @@ from v3d_torch.errors import OutputError
 from v3d_torch.io.state_file import VERSION
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import ViewerGroup
+from v3d_torch.runs import results
 from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import read_request
 from v3d_torch.runs.stored_run import read_run
 
@@ -189,6 +191,27 @@ def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole
     assert len((out / "trajectory.txt").read_text().splitlines()) == 6
     done = call("--resume", out)
     assert done.exit_code == 0 and f"resuming after 6 of {FRAMES} frames" in done.stdout, done.stderr
+    assert_same_results(out, whole_run)
+
+
+def fail_to_write(*_: object, **__: object) -> None:
+    raise OutputError("map.ply: cannot be written (No space left on device); free the disk")
+
+
+def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
+    sequence: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    """The run is too short for an autosave."""
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(results, "write_ply", fail_to_write)
+        done = call(*run_arguments(sequence, out, "--save-masks"))
+    message = "map.ply: cannot be written (No space left on device); free the disk"
+    assert_error_line(done, f"{message}; resume with --resume {out}\n")
+    metrics = read_metrics(out / "metrics.json")
+    assert (metrics.failure, metrics.processed) == (message, FRAMES)
+    done = call("--resume", out)
+    assert done.exit_code == 0 and f"resuming after {FRAMES} of {FRAMES} frames" in done.stdout, done.stderr
     assert_same_results(out, whole_run)
 
 

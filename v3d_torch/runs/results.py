@@ -75,7 +75,7 @@ def write_results(
 
 
 def write_intermediate_results(folder: Path, pipeline: Pipeline) -> None:
-    """Write the results so far of a run in progress, without maps and figures, which take seconds.
+    """Write the results so far of a run in progress or of one that failed, without maps and figures.
 
     Args:
         folder: Folder of the results; made if it is missing.
@@ -101,7 +101,7 @@ def prepare_intermediate_results(folder: Path, pipeline: Pipeline) -> Callable[[
     tables = collect_tables(pipeline)
     done = len(pipeline.slam.poses)
     total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
-    failure = f"killed or still running after {done}{total} frames"
+    failure = pipeline.record.failure or f"killed or still running after {done}{total} frames"
     metrics = _metrics(pipeline, tables.evaluation, failure)
 
     def write() -> None:

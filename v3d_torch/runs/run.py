@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sized
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -111,7 +112,8 @@ class Run:
             incomplete, ``pipeline.record.diagnosis`` is the cause.
 
         Raises:
-            OutputError: If the results cannot be written.
+            OutputError: If the results cannot be written; the message also has the other failures of the run. A
+                checkpoint is saved, if it can be written.
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
@@ -127,10 +129,17 @@ class Run:
         record = self.pipeline(log_and_save)
         is_whole = record.failure is None  # also if a viewer cannot write its file afterwards
         self._autosave.end()
-        point_map = self.pipeline.flush(lambda: self._save_poses(is_whole=is_whole))
-        from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
+        from v3d_torch.runs.results import write_intermediate_results, write_results  # slow, needed only now
 
-        evaluation = write_results(self._folder, self.pipeline, point_map, self._request)
+        try:
+            point_map = self.pipeline.flush(lambda: self._save_poses(is_whole=is_whole))
+            evaluation = write_results(self._folder, self.pipeline, point_map, self._request)
+        except OutputError as error:  # the run is resumed from here when there is space again
+            record.add_failure(str(error))
+            with suppress(OutputError):
+                write_intermediate_results(self._folder, self.pipeline)
+            self._autosave.end()
+            raise OutputError(record.failure) from error
         self._autosave.discard()
         if problem := record.failure or record.diagnosis:
             _LOG.error(problem)
@@ -162,7 +171,7 @@ class Run:
                 beside.unlink(missing_ok=True)  # the map of the same run when it ended early
         except OutputError as error:  # the other results are written nevertheless
             if is_whole:
-                pipeline.record.failure = pipeline.record.failure or str(error)
+                pipeline.record.add_failure(str(error))
                 self._autosave.end()  # a short run has no checkpoint yet, from which the map can be saved again
             else:
                 pipeline.warn([str(error)])
