@@ -215,6 +215,19 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
     assert_same_results(out, whole_run)
 
 
+def test_errors_of_results_and_recording_are_both_reported(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OutputError("demo.mcap: cannot be written")
+
+    monkeypatch.setattr(ViewerGroup, "finish", fail)
+    monkeypatch.setattr(results, "write_ply", fail_to_write)
+    done = call(*run_arguments(sequence, tmp_path / "out"))
+    assert_error_line(done, "error: demo.mcap: cannot be written; map.ply: cannot be written (No space left on device)")
+    assert " ERROR demo.mcap: cannot be written\n" in (tmp_path / "out" / "run.log").read_text()
+
+
 # --- map files
 
 
