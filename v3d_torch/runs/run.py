@@ -25,7 +25,7 @@ from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
-from v3d_torch.runs.request import RunRequest, write_request
+from v3d_torch.runs.request import REQUEST, RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
@@ -133,6 +133,7 @@ class Run:
 
         try:
             point_map = self.pipeline.flush(lambda: self._save_poses(is_whole=is_whole))
+            self._restore_folder()
             evaluation = write_results(self._folder, self.pipeline, point_map, self._request)
         except OutputError as error:  # the run is resumed from here when there is space again
             record.add_failure(str(error))
@@ -144,6 +145,14 @@ class Run:
         if problem := record.failure or record.diagnosis:
             _LOG.error(problem)
         return evaluation
+
+    def _restore_folder(self) -> None:
+        """Write the request again if the folder was removed during the run, and warn of what is lost."""
+        if not (self._folder / REQUEST).is_file():
+            write_request(self._folder, self._request)
+            self.pipeline.warn(
+                [f"{self._folder}: was removed during the run; what was written before is lost, such as log and masks"]
+            )
 
     def _save_poses(self, *, is_whole: bool) -> None:
         """Write what does not need the point map, so that it is not lost if the memory does not suffice to fuse it."""
