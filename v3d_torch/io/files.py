@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EISDIR
@@ -68,6 +69,28 @@ def check_empty_folder(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")
+
+
+@contextmanager
+def emptied_on_failure(folder: Path) -> Iterator[None]:
+    """Remove everything from a folder if the block fails or is interrupted, and the folder if it was missing before.
+
+    Args:
+        folder: Folder that is new or empty, see `check_empty_folder`.
+    """
+    is_new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for path in folder.iterdir():
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+            if is_new:
+                folder.rmdir()
+        raise
 
 
 def write_text(path: Path, text: str) -> None:
