@@ -37,12 +37,14 @@ def atomic_write(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); free the disk or choose another folder"
-        ) from error
+        raise _unwritable_error(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _unwritable_error(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"{path}: cannot be written ({error.strerror or error}); free the disk or choose another folder")
 
 
 def check_writable(path: Path) -> None:
@@ -101,6 +103,19 @@ def write_text(path: Path, text: str) -> None:
     """
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Append a line to a UTF-8 text file, which is made if it is missing.
+
+    Raises:
+        OutputError: As `atomic_write`.
+    """
+    try:
+        with path.open("a", encoding="utf-8", newline="\n") as file:
+            file.write(f"{line}\n")
+    except OSError as error:
+        raise _unwritable_error(path, error) from error
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
