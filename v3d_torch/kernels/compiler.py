@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import cache_dir
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")

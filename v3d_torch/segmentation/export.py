@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from v3d_torch.errors import WeightsError
 from v3d_torch.io.derived_files import derive
-from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import cache_dir
 from v3d_torch.segmentation.networks import LayerGraph, one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
 from v3d_torch.segmentation.networks.head import Segment, boxes_from_distances, cell_grid
 from v3d_torch.segmentation.parts import INNER_TENSORS, OUTPUTS
