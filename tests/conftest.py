@@ -15,7 +15,7 @@ from filelock import FileLock
 from hypothesis import settings
 from rich.console import Console
 
-from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import cache_dir
 
 if TYPE_CHECKING:
     from v3d_torch.datasets.demo.scene import Scene

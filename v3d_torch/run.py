@@ -1,6 +1,9 @@
 """``python -m v3d_torch.run``: the same as ``v3d-torch run``."""
 
-from v3d_torch.cli.run import app
+import sys
+
+from v3d_torch.cli.program import main
 
 if __name__ == "__main__":
-    app()
+    sys.argv.insert(1, "run")
+    main()

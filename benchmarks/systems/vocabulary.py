@@ -17,8 +17,8 @@ import torch
 from numpy.typing import NDArray
 
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.io.download import cache_dir
 from v3d_torch.io.files import file_lock, write_text
+from v3d_torch.io.paths import cache_dir
 
 BRANCHES, DEPTH = 10, 6
 """Shape of the tree, as in ORB-SLAM3's own vocabulary.

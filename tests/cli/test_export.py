@@ -19,9 +19,11 @@ from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import export, run
-from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets import load_sequence, tum_writer
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.export import nerfstudio, posed_image
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.io.files import write_png
 from v3d_torch.io.ply import read_ply_points
 
 FRAMES = 12
@@ -63,6 +65,28 @@ def colmap(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def call(*arguments: str | Path) -> Result:
     return CliRunner().invoke(export.app, list(map(str, arguments)), env={"COLUMNS": "200"})
+
+
+@pytest.mark.parametrize("is_new", [True, False])
+@pytest.mark.parametrize("format_", ["nerfstudio", "colmap", "tum"])
+def test_interrupted_export_can_be_repeated(
+    format_: str, is_new: bool, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    if not is_new:
+        out.mkdir()
+
+    def interrupt(path: Path, image: object) -> None:
+        write_png(path, image)  # type: ignore[arg-type]
+        raise KeyboardInterrupt
+
+    arguments = (results, "--format", format_, "--out", out, "--every", "6")
+    with monkeypatch.context() as patch:
+        for module in (nerfstudio, posed_image, tum_writer):
+            patch.setattr(module, "write_png", interrupt)
+        assert_error_line(call(*arguments), "interrupted before the results were written")
+    assert not files_in(tmp_path) and out.exists() != is_new
+    assert call(*arguments).exit_code == 0 and files_in(out)
 
 
 def test_request_of_the_run_has_absolute_paths(results: Path) -> None:

@@ -92,7 +92,8 @@ def test_damaged_ground_truth_keeps_all_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
-def test_ctrl_c_leaves_complete_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_leaves_complete_folder(number: signal.Signals, tmp_path: Path) -> None:
     folder, out = tmp_path / "long", tmp_path / "out"
     save(folder / "rgb.png", colour_of(0, 640, 480))
     save(folder / "depth.png", depth_of(0, 640, 480))
@@ -103,7 +104,7 @@ def test_ctrl_c_leaves_complete_folder(tmp_path: Path) -> None:
         deadline = time.monotonic() + 60
         while len(list((out / "depth").glob("[0-9]*"))) < 3 and time.monotonic() < deadline:
             time.sleep(0.01)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         stdout, stderr = process.communicate(timeout=60)
     assert (process.returncode, stderr) == (0, "")
     saved = load_sequence(str(out))

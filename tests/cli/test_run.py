@@ -20,6 +20,7 @@ import plyfile
 import pytest
 from helpers.bag_messages import read_with_mcap
 from helpers.commands import RUN_FILES, assert_error_line, call, call_here, environment, files_in
+from helpers.corpus.outputs import at_frame
 from helpers.demo_frames import copy_frames
 from helpers.forked_command import call_forked, start_forked
 from typer.testing import Result
@@ -119,6 +120,20 @@ def test_folder_to_which_another_run_writes_is_an_error_and_stays(sequence: Path
         assert_error_line(done, "out: another run or batch is writing to this folder")
         assert not (tmp_path / "run.rrd").exists()
         assert {(tmp_path / "out" / name).read_text() for name in ("run.log", "metrics.json")} == {"of the other run"}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not remove open files")
+def test_result_folder_that_is_removed_during_the_run_is_complete_and_usable(sequence: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    arguments = (*with_masks(sequence), "--out", out, "--serial")
+    with at_frame(4, lambda: shutil.rmtree(out)):
+        done = call_here(*arguments, cwd=tmp_path)
+    warning = f"{out}: was removed during the run; what was written before is lost, such as log and masks"
+    assert done.exit_code == 0 and f"warning: {warning}\n" in done.stdout, done.stderr
+    assert json.loads((out / "metrics.json").read_text())["warnings"] == [warning]
+    assert files_in(out) >= RUN_FILES and warning in (out / "run.log").read_text()
+    done = call_here(*arguments, cwd=tmp_path)
+    assert done.exit_code == 0 and warning not in done.stdout, done.stderr
 
 
 def test_bag_is_recorded_and_results_are_the_same(first_out: Path, sequence: Path, tmp_path: Path) -> None:

@@ -33,7 +33,9 @@ from v3d_torch.errors import OutputError
 from v3d_torch.io.state_file import VERSION
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import ViewerGroup
+from v3d_torch.runs import results
 from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import read_request
 from v3d_torch.runs.stored_run import read_run
 
@@ -190,6 +192,40 @@ def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole
     done = call("--resume", out)
     assert done.exit_code == 0 and f"resuming after 6 of {FRAMES} frames" in done.stdout, done.stderr
     assert_same_results(out, whole_run)
+
+
+def fail_to_write(*_: object, **__: object) -> None:
+    raise OutputError("map.ply: cannot be written (No space left on device); free the disk")
+
+
+def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
+    sequence: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    """The run is too short for an autosave."""
+    out = tmp_path / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(results, "write_ply", fail_to_write)
+        done = call(*run_arguments(sequence, out, "--save-masks"))
+    message = "map.ply: cannot be written (No space left on device); free the disk"
+    assert_error_line(done, f"{message}; resume with --resume {out}\n")
+    metrics = read_metrics(out / "metrics.json")
+    assert (metrics.failure, metrics.processed) == (message, FRAMES)
+    done = call("--resume", out)
+    assert done.exit_code == 0 and f"resuming after {FRAMES} of {FRAMES} frames" in done.stdout, done.stderr
+    assert_same_results(out, whole_run)
+
+
+def test_errors_of_results_and_recording_are_both_reported(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OutputError("demo.mcap: cannot be written")
+
+    monkeypatch.setattr(ViewerGroup, "finish", fail)
+    monkeypatch.setattr(results, "write_ply", fail_to_write)
+    done = call(*run_arguments(sequence, tmp_path / "out"))
+    assert_error_line(done, "error: demo.mcap: cannot be written; map.ply: cannot be written (No space left on device)")
+    assert " ERROR demo.mcap: cannot be written\n" in (tmp_path / "out" / "run.log").read_text()
 
 
 # --- map files

@@ -14,7 +14,7 @@ import pytest
 from helpers.simulated_realsense import SimulatedDevice
 from typer.testing import CliRunner, Result
 
-from v3d_torch.__main__ import app
+from v3d_torch.cli.commands import app
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import InputError
 

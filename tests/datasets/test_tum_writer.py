@@ -26,6 +26,23 @@ def test_failure_of_source_keeps_saved_frames(tmp_path: Path) -> None:
     assert load_sequence(str(tmp_path / "out")).stamps.tolist() == [12.5]
 
 
+def test_frames_are_listed_at_once(tmp_path: Path) -> None:
+    """A process that is killed does not leave the context."""
+    image, depth = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.ones(1, HEIGHT, WIDTH)
+    writer = TUMWriter(tmp_path / "out", PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=1000))
+    for count in (1, 2):
+        writer.add(RGBDFrame(count, count, image, depth, depth_delay=0.25))
+        assert len(load_sequence(str(tmp_path / "out"))) == len(writer) == count
+        last = f"{count + 0.25:.6f}"
+        assert (tmp_path / "out" / "depth.txt").read_text().splitlines()[-1] == f"{last} depth/{last}.png"
+
+
+def test_source_without_frames_leaves_the_folder_empty(tmp_path: Path) -> None:
+    with TUMWriter(tmp_path / "out", PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT)):
+        pass
+    assert not list((tmp_path / "out").iterdir())
+
+
 def test_depth_is_exact_and_out_of_range_is_zero(tmp_path: Path) -> None:
     camera = PinholeCamera(1, 2, 3, 4, 256, 256, depth_scale=1000)
     units = torch.arange(256 * 256, dtype=torch.float32).reshape(1, 256, 256)

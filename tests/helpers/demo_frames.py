@@ -9,7 +9,7 @@ from filelock import FileLock
 
 from v3d_torch.datasets.demo import ensure_demo
 from v3d_torch.datasets.demo.sequence import FRAME_RATE, START_STAMP
-from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import cache_dir
 
 _IMAGES = ("rgb", "depth", "masks", "instances")
 _LISTS = ("rgb.txt", "depth.txt", "associations.txt", "groundtruth.txt")

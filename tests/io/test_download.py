@@ -14,7 +14,7 @@ from typing import ClassVar
 import pytest
 
 from v3d_torch.errors import DownloadError, OutputError
-from v3d_torch.io.download import cache_dir, fetch
+from v3d_torch.io.download import fetch
 
 CONTENT = bytes(range(256)) * 4000  # about a megabyte: several chunks
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -214,10 +214,3 @@ def test_unwritable_folder_is_an_output_error(server: str, tmp_path: Path) -> No
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(OutputError, match="choose another folder"):
         fetch(f"{server}/plain", tmp_path / "file" / "inside")
-
-
-def test_cache_dir_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("V3D_CACHE", str(tmp_path))
-    assert cache_dir() == tmp_path
-    monkeypatch.delenv("V3D_CACHE")
-    assert cache_dir().name == "v3d_torch"

@@ -9,10 +9,9 @@ import pytest
 from helpers.tiny_images import colour_of, depth_of, save
 from typer.testing import CliRunner
 
-from v3d_torch.__main__ import COMMANDS
+from v3d_torch.cli.commands import COMMANDS
 from v3d_torch.datasets import load_sequence
-from v3d_torch.io.download import cache_dir
-from v3d_torch.io.paths import expand_user
+from v3d_torch.io.paths import cache_dir, expand_user
 
 CAMERA = "fx: 30\nfy: 30\ncx: 15.5\ncy: 11.5\nwidth: 32\nheight: 24\ndepth_scale: 5000\n"
 
@@ -62,3 +61,10 @@ def test_every_command_expands_home(module: ModuleType) -> None:
 
 def test_home_of_an_unknown_user_stays_unchanged() -> None:
     assert expand_user("~nobody-of-that-name/x") == Path("~nobody-of-that-name/x")
+
+
+def test_cache_dir_is_set_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("V3D_CACHE", str(tmp_path))
+    assert cache_dir() == tmp_path
+    monkeypatch.delenv("V3D_CACHE")
+    assert cache_dir().name == "v3d_torch"

@@ -215,6 +215,29 @@ def test_code_is_shared_by_copies_of_a_file_and_not_by_other_files(
     assert compiled == [1, 0, 1]
 
 
+@needs_numba
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize("kept", [0, 0.5])
+def test_kernel_with_a_damaged_file_in_the_cache_is_compiled_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, kept: float
+) -> None:
+    """As after a loss of power, which leaves files empty or truncated."""
+    monkeypatch.setattr(compiler, "_code_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiler, "_TO_COMPILE", compiler.deque())
+    path, compiled = tmp_path / "scaling.py", []
+    path.write_text(
+        "from v3d_torch.kernels.compiler import kernel\n@kernel('f8(f8)')\ndef scale(x):\n    return 2 * x\n"
+    )
+    for run in range(3):
+        scale = runpy.run_path(str(path), run_name="scaling")["scale"]
+        compiled += [count for count, _ in compiler.compile_kernels()]
+        assert scale(5.0) == 10
+        if run == 0:
+            (damaged,) = tmp_path.glob(f"*{suffix}")
+            os.truncate(damaged, int(kept * damaged.stat().st_size))
+    assert compiled == [1, 1, 0]
+
+
 def test_parameter_of_a_module_can_be_read() -> None:
     plain = torch.zeros(2, requires_grad=True)
     assert can_read(plain) and can_read(torch.nn.Parameter(plain.detach()))

@@ -14,7 +14,7 @@ import pytest
 from typer.main import get_command
 
 import v3d_torch
-from v3d_torch.__main__ import COMMANDS
+from v3d_torch.cli.commands import COMMANDS
 
 ROOT = Path(v3d_torch.__file__).parents[1]
 

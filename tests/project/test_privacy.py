@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from v3d_torch.config import SegmentationConfig
-from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import cache_dir
 from v3d_torch.segmentation import YOLOSegmenter
 from v3d_torch.segmentation.onnx_runtime import import_onnxruntime
 

@@ -12,7 +12,7 @@ import torch
 from typer.main import get_command
 
 import v3d_torch
-from v3d_torch.__main__ import COMMANDS
+from v3d_torch.cli.commands import COMMANDS
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.slam import V3DSLAM

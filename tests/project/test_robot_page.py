@@ -17,7 +17,7 @@ from helpers.simulated_realsense import SimulatedDevice
 from typer.testing import CliRunner
 
 import v3d_torch as v3d
-from v3d_torch.__main__ import app
+from v3d_torch.cli.commands import app
 from v3d_torch.config.loading import load_config
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf-8")

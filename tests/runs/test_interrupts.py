@@ -39,10 +39,11 @@ def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-def test_first_ctrl_c_ends_a_camera_that_sends_nothing() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_ends_a_camera_that_sends_nothing(number: signal.Signals) -> None:
     camera = WaitingCamera()
     with interrupts_between_frames(camera) as interrupted:
-        threading.Timer(0.1, press_ctrl_c).start()
+        threading.Timer(0.1, os.kill, (os.getpid(), number)).start()
         assert list(camera) == []
         assert interrupted.is_set() and camera.stopped.is_set()
 
@@ -82,11 +83,12 @@ def test_second_ctrl_c_interrupts_at_once() -> None:
 
 
 def test_camera_is_not_stopped_without_ctrl_c() -> None:
-    camera, before = WaitingCamera(), signal.getsignal(signal.SIGINT)
+    camera, signals = WaitingCamera(), (signal.SIGINT, signal.SIGTERM)
+    before = list(map(signal.getsignal, signals))
     threads = set(threading.enumerate())
     with interrupts_between_frames(camera) as interrupted:
         watching = set(threading.enumerate()) - threads
     for thread in watching:
         thread.join(5)
     assert not interrupted.is_set() and not camera.stopped.is_set()
-    assert signal.getsignal(signal.SIGINT) == before and set(threading.enumerate()) <= threads
+    assert list(map(signal.getsignal, signals)) == before and set(threading.enumerate()) <= threads

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,21 @@ def test_message_is_one_line_without_control_characters(tmp_path: Path) -> None:
     text = path.read_text()
     assert text.splitlines()[0].endswith("forged\\x1b]0;title\\x1b\\ is broken")
     assert "Traceback (most recent call last):\n" in text and "\x1b" not in text
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows does not remove open files")
+def test_removed_log_begins_again_when_there_is_a_folder(tmp_path: Path) -> None:
+    path = tmp_path / "out" / "run.log"
+    path.parent.mkdir()
+    with log_to(path):
+        LOG.warning("first")
+        shutil.rmtree(path.parent)
+        LOG.warning("second")
+        assert not path.parent.exists()
+        path.parent.mkdir()
+        LOG.warning("third")
+        LOG.warning("fourth")
+    assert [line.split()[-1] for line in path.read_text().splitlines()] == ["third", "fourth"]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="symbolic links on Windows need special permissions")

@@ -146,6 +146,30 @@ def test_network_is_exported_once_for_each_size(tmp_path: Path, monkeypatch: pyt
     assert exported_path("yolo26n-seg", weights, 96, 64) != first
 
 
+def test_damaged_files_of_a_network_in_the_cache_are_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A flipped bit in the weights still gives a network that runs, with other masks."""
+    weights = find_weights("yolo26n-seg")
+    monkeypatch.setenv("V3D_CACHE", str(tmp_path))
+    config = SegmentationConfig(model="yolo26n-seg", precision="float32", height=64, width=96, threads=1)
+    YOLOSegmenter(config, weights)
+    files = sorted((tmp_path / "networks").glob("*.onnx"))
+    before = [path.read_bytes() for path in files]
+    for path, content in zip(files, before, strict=True):
+        middle = len(content) // 2
+        path.write_bytes(content[:middle] + bytes([content[middle] ^ 0x40]) + content[middle + 1 :])
+    YOLOSegmenter(config, weights)
+    assert [path.read_bytes() for path in files] == before
+
+
+def test_truncated_onnx_file_of_the_user_is_rejected(tmp_path: Path) -> None:
+    path = tmp_path / "mine.onnx"
+    path.write_bytes(exported_path("yolo26n-seg", find_weights("yolo26n-seg"), 320, 320).read_bytes()[:100_000])
+    with pytest.raises(WeightsError, match=r"mine\.onnx: is not a network that onnxruntime can load"):
+        YOLOSegmenter(SegmentationConfig(), weights=path)
+
+
 def test_onnx_files_without_a_raw_head_are_rejected(tmp_path: Path) -> None:
     image = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 64, 64])
     output = helper.make_tensor_value_info("output0", TensorProto.FLOAT, [1, 3, 64, 64])

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from v3d_torch.cli.program import exit_on_interrupt
 from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, V3DError
 from v3d_torch.io.text import printable
 
@@ -15,7 +16,7 @@ from v3d_torch.io.text import printable
 def exit_on_error() -> Iterator[None]:
     """Print an error that a user can fix as one line on stderr, and exit with code 2."""
     try:
-        with warnings.catch_warnings():
+        with exit_on_interrupt(), warnings.catch_warnings():
             for reported in (GroundTruthWarning, DepthScaleWarning):  # by the commands, as errors and notes
                 warnings.simplefilter("ignore", reported)
             yield
@@ -29,7 +30,4 @@ def exit_on_error() -> Iterator[None]:
         else:
             message = f"{error.filename}: cannot be used ({reason}); check path and permissions"
         print(f"error: {printable(message)}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("error: interrupted before the results were written", file=sys.stderr)
         sys.exit(2)

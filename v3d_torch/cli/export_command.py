@@ -19,7 +19,7 @@ from v3d_torch.export.nerfstudio import write_nerfstudio
 from v3d_torch.export.posed_image import PosedImage, Undistorter
 from v3d_torch.export.static_recording import StaticRecording
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.io.files import check_empty_folder
+from v3d_torch.io.files import check_empty_folder, emptied_on_failure
 from v3d_torch.io.ply import read_ply_points
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.mapping.map_tables import MapTables
@@ -84,7 +84,8 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
     if options.undistort:
         undistort = Undistorter(source.camera)
         out_camera, shown = undistort.camera, map(undistort, shown)
-    notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
+    with emptied_on_failure(out):  # else, the same command would reject the folder
+        notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
     if left_out := len(run.metrics.status) - len(located_frames(run)):
         notes.append(f"{left_out} frames without a known pose are left out")
     print_line(console, f"{len(frames)} images: {out}")

@@ -96,5 +96,6 @@ def record_static(
         record = pipeline(on_frame)
         with torch.inference_mode():
             slam.flush()
-        recording.write_poses(slam.poses.trajectory())
+        if len(writer):
+            recording.write_poses(slam.poses.trajectory())
     return len(writer), None if record.interrupted else record.failure

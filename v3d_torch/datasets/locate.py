@@ -15,17 +15,17 @@ from v3d_torch.datasets.sequence_names import (
     unknown_name_error,
 )
 from v3d_torch.errors import DownloadError, InputError
-from v3d_torch.io.download import Progress, cache_dir, fetch
+from v3d_torch.io.download import Progress, fetch
 from v3d_torch.io.extract import extract_tar
 from v3d_torch.io.files import file_lock
-from v3d_torch.io.paths import expand_user
+from v3d_torch.io.paths import cache_dir, expand_user
 
 
 def find_or_download(name: str, *, data_root: Path | None, download: bool, progress: Progress | None) -> Path:
     """Find the folder or file of a sequence, or download the sequence.
 
     The search order is: ``name`` as a path; ``data_root``, or else ``$V3D_DATA``; the cache
-    (`v3d_torch.io.download.cache_dir`). In the last two, a folder can have any spelling of the name. A missing TUM
+    (`v3d_torch.io.paths.cache_dir`). In the last two, a folder can have any spelling of the name. A missing TUM
     sequence is downloaded to ``data_root`` if given, or else to the cache. ``$V3D_DATA`` can be shared and is never
     written to.
 

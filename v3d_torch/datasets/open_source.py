@@ -16,8 +16,8 @@ from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError
-from v3d_torch.io.download import Progress, cache_dir
-from v3d_torch.io.paths import StrPath, expand_user
+from v3d_torch.io.download import Progress
+from v3d_torch.io.paths import StrPath, cache_dir, expand_user
 
 _MIN_FPS, _MAX_FPS = 0.01, 1e4
 """Accepted range of frame rates, Hz: far wider than that of cameras; it excludes 0, negative values and NaN."""

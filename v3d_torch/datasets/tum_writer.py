@@ -14,13 +14,15 @@ from v3d_torch.datasets.gravity_file import write_gravity_file
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import SATURATED_DEPTH
-from v3d_torch.io.files import check_empty_folder, write_png, write_text
+from v3d_torch.io.files import append_line, check_empty_folder, check_writable, write_png, write_text
 from v3d_torch.types import RGBDFrame, Trajectory
 
 _LOG = logging.getLogger(__name__)
 
 _DEPTH_SCALE = 5000.0
 """Depth scale of the TUM benchmark, units per metre."""
+
+_CAMERA = "camera.yaml"
 
 _GROUND_TRUTH, _COMMENT = "groundtruth.txt", "poses of the camera, written by v3d-torch"
 """Name and first line of the file of measured poses."""
@@ -29,8 +31,9 @@ _GROUND_TRUTH, _COMMENT = "groundtruth.txt", "poses of the camera, written by v3
 class TUMWriter:
     """Writer of RGB-D frames to a folder in TUM layout, used as a context manager.
 
-    Images are written immediately. The lists of images are written at the end of the context, also after an exception;
-    if depth was out of range, a warning is logged then.
+    Each frame is written and listed immediately, so that a process that is killed loses no frame. The first one also
+    writes the camera and the ground truth: a source without frames leaves the folder empty. If depth was out of range,
+    a warning is logged at the end of the context.
 
     Args:
         folder: Folder of the sequence, new or empty.
@@ -44,15 +47,12 @@ class TUMWriter:
 
     def __init__(self, folder: Path, camera: PinholeCamera, groundtruth: Trajectory | None = None) -> None:
         check_empty_folder(folder)
+        check_writable(folder / _CAMERA)
         self.folder = folder
+        self._camera, self._groundtruth = camera, groundtruth
         self._depth_scale = _DEPTH_SCALE if camera.depth_scale is None else camera.depth_scale
-        self._written: list[tuple[str, str]] = []
+        self._count = 0
         self._out_of_range = 0
-        # The depth of the frames is already corrected.
-        written = replace(camera, depth_scale=self._depth_scale, inverse_depth_offset=0.0)
-        write_text(folder / "camera.yaml", camera_text(written))
-        if groundtruth is not None:
-            write_trajectory(folder / _GROUND_TRUTH, groundtruth, comment=_COMMENT)
 
     def __enter__(self) -> TUMWriter:
         return self
@@ -60,13 +60,6 @@ class TUMWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        lists = {
-            "rgb.txt": [f"{stamp} rgb/{stamp}.png" for stamp, _ in self._written],
-            "depth.txt": [f"{stamp} depth/{stamp}.png" for _, stamp in self._written],
-            "associations.txt": [f"{rgb} rgb/{rgb}.png {depth} depth/{depth}.png" for rgb, depth in self._written],
-        }
-        for name, lines in lists.items():
-            write_text(self.folder / name, "".join(f"{line}\n" for line in lines))
         if self._out_of_range:
             _LOG.warning(
                 "%s: %d depth values beyond %.4g m were saved as 0; a camera with a smaller depth_scale keeps them",
@@ -75,23 +68,37 @@ class TUMWriter:
 
     def __len__(self) -> int:
         """Number of frames written."""
-        return len(self._written)
+        return self._count
 
     def add(self, frame: RGBDFrame) -> None:
-        """Write the images of a frame, and the gravity of the first frame to ``gravity.txt`` if it was measured.
+        """Write the images of a frame, list them, and write the gravity of the first frame if it was measured.
 
         Depth is rounded to units of the depth scale; beyond the 16-bit range, it is written as 0, no measurement.
         """
-        if frame.gravity is not None and not self._written:
-            write_gravity_file(self.folder, frame.stamp, frame.gravity)
-        stamps = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
+        if not self._count:
+            self._write_camera()
+            if frame.gravity is not None:
+                write_gravity_file(self.folder, frame.stamp, frame.gravity)
+        rgb, depth = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
+        listed_rgb, listed_depth = f"{rgb} rgb/{rgb}.png", f"{depth} depth/{depth}.png"
         units = np.rint(frame.depth[0].numpy() * self._depth_scale)
         is_out_of_range = units >= SATURATED_DEPTH
         units[is_out_of_range] = 0
         self._out_of_range += int(is_out_of_range.sum())
-        write_png(self.folder / "rgb" / f"{stamps[0]}.png", frame.image.permute(1, 2, 0).numpy())
-        write_png(self.folder / "depth" / f"{stamps[1]}.png", units.astype(np.uint16))
-        self._written.append(stamps)
+        write_png(self.folder / "rgb" / f"{rgb}.png", frame.image.permute(1, 2, 0).numpy())
+        write_png(self.folder / "depth" / f"{depth}.png", units.astype(np.uint16))
+        append_line(self.folder / "rgb.txt", listed_rgb)
+        append_line(self.folder / "depth.txt", listed_depth)
+        append_line(self.folder / "associations.txt", f"{listed_rgb} {listed_depth}")
+        self._count += 1
+
+    def _write_camera(self) -> None:
+        """Write the camera, and its measured poses."""
+        # The depth of the frames is already corrected.
+        written = replace(self._camera, depth_scale=self._depth_scale, inverse_depth_offset=0.0)
+        write_text(self.folder / _CAMERA, camera_text(written))
+        if self._groundtruth is not None:
+            write_trajectory(self.folder / _GROUND_TRUTH, self._groundtruth, comment=_COMMENT)
 
 
 def is_recorded_truth(folder: Path) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import http.client
-import os
 import re
 import urllib.error
 import urllib.request
@@ -14,21 +13,13 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import urlsplit
 
-from platformdirs import user_cache_path
-
 from v3d_torch.errors import DownloadError, OutputError
-from v3d_torch.io.paths import expand_user
 
 Progress = Callable[[int, int | None], None]
 """Called with the amount done and the total amount (None if unknown), both in bytes for downloads."""
 
 _CHUNK_SIZE = 1 << 18
 _LOOPBACK_HOSTS = ("localhost", "127.0.0.1", "::1")
-
-
-def cache_dir() -> Path:
-    """Return the cache folder for downloads and generated files: ``$V3D_CACHE``, else the platform's user cache."""
-    return expand_user(os.environ.get("V3D_CACHE") or user_cache_path("v3d_torch"))
 
 
 def fetch(

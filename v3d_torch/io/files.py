@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EISDIR
@@ -36,12 +37,14 @@ def atomic_write(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except OSError as error:
-        raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}); free the disk or choose another folder"
-        ) from error
+        raise _unwritable_error(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def _unwritable_error(path: Path, error: OSError) -> OutputError:
+    return OutputError(f"{path}: cannot be written ({error.strerror or error}); free the disk or choose another folder")
 
 
 def check_writable(path: Path) -> None:
@@ -70,6 +73,28 @@ def check_empty_folder(folder: Path) -> None:
         raise OutputError(f"{folder}: already exists and is not an empty folder; choose another folder with --out")
 
 
+@contextmanager
+def emptied_on_failure(folder: Path) -> Iterator[None]:
+    """Remove everything from a folder if the block fails or is interrupted, and the folder if it was missing before.
+
+    Args:
+        folder: Folder that is new or empty, see `check_empty_folder`.
+    """
+    is_new = not folder.exists()
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for path in folder.iterdir():
+                if path.is_dir() and not path.is_symlink():
+                    shutil.rmtree(path)
+                else:
+                    path.unlink()
+            if is_new:
+                folder.rmdir()
+        raise
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a UTF-8 text file atomically.
 
@@ -78,6 +103,19 @@ def write_text(path: Path, text: str) -> None:
     """
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def append_line(path: Path, line: str) -> None:
+    """Append a line to a UTF-8 text file, which is made if it is missing.
+
+    Raises:
+        OutputError: As `atomic_write`.
+    """
+    try:
+        with path.open("a", encoding="utf-8", newline="\n") as file:
+            file.write(f"{line}\n")
+    except OSError as error:
+        raise _unwritable_error(path, error) from error
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:

@@ -1,4 +1,4 @@
-"""Expansion of ``~`` to the home folder in paths given by users.
+"""Expansion of ``~`` to the home folder in paths given by users, the cache folder, and names of result folders.
 
 Shells expand ``~`` in ``--out ~/x``, but not in ``--out=~/x``, in environment variables in quotes, or in Python.
 """
@@ -11,6 +11,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Any
 
+from platformdirs import user_cache_path
+
 StrPath = str | os.PathLike[str]
 """A path as a string or as a path object."""
 
@@ -21,6 +23,11 @@ def expand_user(path: StrPath) -> Path:
         return Path(path).expanduser()
     except RuntimeError:
         return Path(path)
+
+
+def cache_dir() -> Path:
+    """Return the cache folder for downloads and generated files: ``$V3D_CACHE``, else the platform's user cache."""
+    return expand_user(os.environ.get("V3D_CACHE") or user_cache_path("v3d_torch"))
 
 
 def expand_user_paths(command: Callable[..., None]) -> Callable[..., None]:

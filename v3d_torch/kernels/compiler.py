@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.io.download import cache_dir
+from v3d_torch.io.paths import cache_dir
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -135,11 +135,20 @@ def compile_kernels(*, backwards: bool = False) -> Iterator[tuple[int, int]]:
             if not _TO_COMPILE:
                 return
             each, signature = _TO_COMPILE[-1 if backwards else 0]
-            each.compile(signature)
+            _load_or_compile(each, signature)
             each.disable_compile()  # arguments of other types are converted or raise an error
             _TO_COMPILE.remove((each, signature))
         compiled += sum(each.stats.cache_misses.values())
         yield compiled, len(_TO_COMPILE)
+
+
+def _load_or_compile(function: Any, signature: str) -> None:
+    """Load a kernel from the cache, or compile it if it is not in the cache, or if its files there are damaged."""
+    try:
+        function.compile(signature)
+    except Exception:  # unpickling a damaged file can raise any error; another error is raised again below
+        function._cache.flush()  # empties the index of this kernel, so that none of its files is loaded
+        function.compile(signature)
 
 
 def compiled_by(

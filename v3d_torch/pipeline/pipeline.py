@@ -244,7 +244,8 @@ class Pipeline:
         try:
             self._viewer.finish(self.slam, point_map)
         except V3DError as error:
-            self.record.failure = self.record.failure or str(error)
+            _LOG.error(error)
+            self.record.add_failure(str(error))
         return point_map
 
     def warn(self, warnings: Iterable[str]) -> None:

@@ -219,7 +219,8 @@ class RunRecord:
         mask_evaluation: Comparison of the masks with true masks.
         broken: Broken frames that were skipped.
         seconds: Wall time of all frames, seconds.
-        failure: Reason why the run ended before the end of the sequence; None if it did not.
+        failure: Reason why the run ended before the end of the sequence, or why a file of a whole run could not be
+            written; None if there is none.
         diagnosis: Cause of incomplete results of a run that reached the end of the sequence; None if they are complete.
         interrupted: True if the user interrupted the run.
         mask_error: Reason why the masks were not evaluated although there are true masks; None if there was no error.
@@ -250,3 +251,7 @@ class RunRecord:
     repeated: RepeatedImages = field(default_factory=RepeatedImages)
     people_sizes: list[float] = field(default_factory=list)
     was_checked: bool = False
+
+    def add_failure(self, reason: str) -> None:
+        """Record a failure after the last frame, after those recorded before."""
+        self.failure = reason if self.failure is None else f"{self.failure}; {reason}"

@@ -1,4 +1,4 @@
-"""Ctrl-C between two frames."""
+"""Ctrl-C, or the signal to end a process, between two frames."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ from types import FrameType
 
 from v3d_torch.datasets.base import LiveStream, RGBDStream
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a run: that of Ctrl-C, and that with which a system or a container ends its processes."""
+
 _STOP_INTERVAL = 0.1
-"""Interval at which a source is stopped after Ctrl-C, seconds."""
+"""Interval at which a source is stopped after a signal, seconds."""
 
 
 @contextmanager
 def interrupts_between_frames(source: RGBDStream | None = None) -> Iterator[Event]:
-    """Delay Ctrl-C until the current frame is complete; a second Ctrl-C interrupts at once.
+    """Delay Ctrl-C and SIGTERM until the current frame is complete; a second one interrupts at once.
 
     Args:
-        source: Source of the frames. Ctrl-C also stops a `LiveStream`, because the next frame of a camera that was
+        source: Source of the frames. The signal also stops a `LiveStream`, because the next frame of a camera that was
             unplugged may never come. None, or a source of another kind, is not stopped.
 
     Returns:
-        Event that is set by Ctrl-C.
+        Event that is set by the signal.
 
     Raises:
         ValueError: If this is not the main thread.
@@ -36,20 +39,21 @@ def interrupts_between_frames(source: RGBDStream | None = None) -> Iterator[Even
         interrupted.set()
         woken.set()
 
-    previous = signal.signal(signal.SIGINT, delay)
+    previous = {each: signal.signal(each, delay) for each in _SIGNALS}
     try:
         if isinstance(source, LiveStream):
             # In a thread: the handler runs in the main thread, which can hold a lock that stop needs.
             Thread(target=_stop_after_waking, args=(source, woken, is_over), daemon=True).start()
         yield interrupted
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for each, handler in previous.items():
+            signal.signal(each, handler)
         is_over.set()
         woken.set()
 
 
 def _stop_after_waking(source: LiveStream, woken: Event, is_over: Event) -> None:
-    """Wait for Ctrl-C or for the end of the context, and stop the source until the end of the context.
+    """Wait for a signal or for the end of the context, and stop the source until the end of the context.
 
     One stop is not enough: it has no effect on an iteration that begins later.
     """

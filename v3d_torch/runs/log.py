@@ -6,6 +6,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from logging.handlers import WatchedFileHandler
 from pathlib import Path
 
 from v3d_torch.errors import OutputError
@@ -90,8 +91,15 @@ class _Warnings(logging.Handler):
             self._show(f"warning: {record.getMessage()}")
 
 
-class _LogFile(logging.FileHandler):
-    """Log file that ignores a full disk: the run continues, and the error is reported when results are written."""
+class _LogFile(WatchedFileHandler):
+    """Log file that ignores a full disk: the run continues, and the error is reported when results are written.
+
+    If the file is removed, it begins again with the next message for which its folder exists.
+    """
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with suppress(OSError):  # the folder does not exist
+            super().emit(record)
 
     def handleError(self, record: logging.LogRecord) -> None:
         if not isinstance(sys.exception(), OSError):

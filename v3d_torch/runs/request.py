@@ -23,7 +23,8 @@ from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
 from v3d_torch.io.text import read_text
 
-_FILE = "request.yaml"
+REQUEST = "request.yaml"
+"""Name of the file with the options of a run, which is written before its first frame."""
 
 CHANGEABLE = ("seq", "data_root", "skip_broken")
 """Names of the options that can change when a run is resumed."""
@@ -128,7 +129,7 @@ def write_request(folder: Path, request: RunRequest) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    write_text(folder / _FILE, yaml.safe_dump(request.absolute()._options(), sort_keys=False))
+    write_text(folder / REQUEST, yaml.safe_dump(request.absolute()._options(), sort_keys=False))
 
 
 def read_request(folder: Path) -> RunRequest:
@@ -140,7 +141,7 @@ def read_request(folder: Path) -> RunRequest:
     Raises:
         InputError: If the file is missing or damaged.
     """
-    path = folder / _FILE
+    path = folder / REQUEST
     text = read_text(path, "it is written by a run")
     try:
         options = parse_yaml(text)

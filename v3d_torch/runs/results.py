@@ -78,7 +78,7 @@ def write_results(folder: Path, pipeline: Pipeline, request: RunRequest | None =
 
 
 def prepare_intermediate_results(folder: Path, pipeline: Pipeline) -> Callable[[], None]:
-    """Collect the results so far of a run in progress, without maps and figures, which take seconds.
+    """Collect the results so far of a run in progress or of one that failed, without maps and figures.
 
     Args:
         folder: Folder of the results; made if it is missing.
@@ -129,7 +129,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
         "warnings": list(run.warnings),
         "gravity": None if slam.gravity is None else slam.gravity.tolist(),
         "T_lw": None if (T_lw := slam.T_lw) is None else T_lw.tolist(),
-        "failure": f"killed or still running after {frames}{total} frames",
+        "failure": run.failure or f"killed or still running after {frames}{total} frames",
         "diagnosis": run.diagnosis,
         "latency": run.live.latency_statistics(),
         "dropped": run.live.dropped,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Sized
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -24,7 +25,7 @@ from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
-from v3d_torch.runs.request import RunRequest, write_request
+from v3d_torch.runs.request import REQUEST, RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
@@ -111,7 +112,8 @@ class Run:
             incomplete, ``pipeline.record.diagnosis`` is the cause.
 
         Raises:
-            OutputError: If the results cannot be written.
+            OutputError: If the results cannot be written; the message also has the other failures of the run. A
+                checkpoint is saved, if it can be written.
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
@@ -127,18 +129,34 @@ class Run:
         record = self.pipeline(log_and_save)
         is_whole = record.failure is None  # also if a viewer cannot write its file afterwards
         self._autosave.end()
-        self.pipeline.flush()
-        slam = self.pipeline.slam
-        _LOG.info("readout: %s", describe_readout(slam.map.readout, slam.config.rolling_shutter))
-        if self._map_file is not None:
-            self._save_map(self._map_file, is_whole=is_whole)
-        from v3d_torch.runs.results import write_results  # pyarrow and matplotlib would delay the first frame
+        from v3d_torch.runs.results import prepare_intermediate_results, write_results  # slow, needed only now
 
-        evaluation = write_results(self._folder, self.pipeline, self._request)
+        try:
+            self.pipeline.flush()
+            slam = self.pipeline.slam
+            _LOG.info("readout: %s", describe_readout(slam.map.readout, slam.config.rolling_shutter))
+            if self._map_file is not None:
+                self._save_map(self._map_file, is_whole=is_whole)
+            self._restore_folder()
+            evaluation = write_results(self._folder, self.pipeline, self._request)
+        except OutputError as error:  # the run is resumed from here when there is space again
+            record.add_failure(str(error))
+            with suppress(OutputError):
+                prepare_intermediate_results(self._folder, self.pipeline)()
+            self._autosave.end()
+            raise OutputError(record.failure) from error
         self._autosave.discard()
         if problem := record.failure or record.diagnosis:
             _LOG.error(problem)
         return evaluation
+
+    def _restore_folder(self) -> None:
+        """Write the request again if the folder was removed during the run, and warn of what is lost."""
+        if not (self._folder / REQUEST).is_file():
+            write_request(self._folder, self._request)
+            self.pipeline.warn(
+                [f"{self._folder}: was removed during the run; what was written before is lost, such as log and masks"]
+            )
 
     def _save_map(self, path: Path, *, is_whole: bool) -> None:
         """Write the map file; a part of a map is written beside a map file that exists, and does not replace it."""
@@ -156,7 +174,7 @@ class Run:
                 beside.unlink(missing_ok=True)  # the map of the same run when it ended early
         except OutputError as error:  # the other results are written nevertheless
             if is_whole:
-                pipeline.record.failure = pipeline.record.failure or str(error)
+                pipeline.record.add_failure(str(error))
                 self._autosave.end()  # a short run has no checkpoint yet, from which the map can be saved again
             else:
                 pipeline.warn([str(error)])

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from v3d_torch.errors import WeightsError
-from v3d_torch.io.download import cache_dir
-from v3d_torch.io.files import atomic_write, file_lock
+from v3d_torch.io.derived_files import derive
+from v3d_torch.io.paths import cache_dir
 from v3d_torch.segmentation.networks import LayerGraph, one_to_one, yolo11n_seg, yolo26n_seg, yolov8n_seg
 from v3d_torch.segmentation.networks.head import Segment, boxes_from_distances, cell_grid
 from v3d_torch.segmentation.parts import INNER_TENSORS, OUTPUTS
@@ -34,7 +34,7 @@ _BUILDERS: dict[str, Callable[[], LayerGraph]] = {
 
 
 def exported_path(model: str, weights: Path, height: int, width: int) -> Path:
-    """Path of the ONNX file for images of one size; the file is written on first use.
+    """Path of the ONNX file for images of one size; the file is written on first use, or if damaged.
 
     Args:
         model: Name of the model, a key of `REGISTRY`.
@@ -51,13 +51,7 @@ def exported_path(model: str, weights: Path, height: int, width: int) -> Path:
     """
     sha256 = REGISTRY[model].sha256
     target = cache_dir() / "networks" / f"{model}-{sha256[:12]}-{height}x{width}-v{_VERSION}.onnx"
-    if target.is_file():
-        return target
-    with file_lock(target):
-        if not target.is_file():
-            network = build(model, read_pt_weights(weights, sha256))
-            with atomic_write(target) as draft:
-                export(network, height, width, draft)
+    derive([target], lambda draft: export(build(model, read_pt_weights(weights, sha256)), height, width, draft))
     return target
 
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from v3d_torch.io.files import atomic_write, file_lock
+from v3d_torch.io.derived_files import derive
 
 if TYPE_CHECKING:
     import onnx
@@ -45,7 +45,7 @@ class PartPaths(NamedTuple):
 
 
 def split_paths(path: Path) -> PartPaths:
-    """Paths of the parts of a network, beside the original; the files are written on first use.
+    """Paths of the parts of a network, beside the original; the files are written on first use, or if damaged.
 
     Args:
         path: ONNX file written by `export` or `quantise`.
@@ -54,11 +54,7 @@ def split_paths(path: Path) -> PartPaths:
         OutputError: If the folder is not writable.
     """
     targets = PartPaths(*(path.with_name(f"{path.stem}-{part}-v{_VERSION}.onnx") for part in PartPaths._fields))
-    if all(target.is_file() for target in targets):
-        return targets
-    with file_lock(targets.scores):
-        if not all(target.is_file() for target in targets):
-            split(path, targets)
+    derive(targets, lambda *drafts: split(path, PartPaths(*drafts)))
     return targets
 
 
@@ -75,9 +71,7 @@ def split(path: Path, targets: PartPaths) -> None:
     image = [value.name for value in model.graph.input]
     cuts = ((image, [*LEVELS, "scores"]), (LEVELS, ["distances", "coefficients"]), (LEVELS, ["output1"]))
     for (inputs, outputs), target in zip(cuts, targets, strict=True):
-        part = _extract(model, inputs, outputs)
-        with atomic_write(target) as draft:
-            onnx.save(part, draft)
+        onnx.save(_extract(model, inputs, outputs), target)
 
 
 def _extract(model: onnx.ModelProto, inputs: Sequence[str], outputs: Sequence[str]) -> onnx.ModelProto:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.images import read_colour
-from v3d_torch.io.files import atomic_write, file_lock
+from v3d_torch.io.derived_files import derive
 from v3d_torch.segmentation.letterbox import letterbox
 from v3d_torch.segmentation.onnx_runtime import import_onnxruntime
 
@@ -48,7 +48,7 @@ def has_int8_instructions() -> bool:
 
 
 def quantised_path(path: Path) -> Path:
-    """Path of the 8-bit version of a network, beside the original; the file is written on first use.
+    """Path of the 8-bit version of a network, beside the original; the file is written on first use, or if damaged.
 
     Args:
         path: ONNX file with one input of shape (1, 3, H, W), RGB in [0, 1].
@@ -60,13 +60,7 @@ def quantised_path(path: Path) -> Path:
         OutputError: If the folder is not writable.
     """
     target = path.with_name(f"{path.stem}-int8-v{_VERSION}.onnx")
-    if target.is_file():
-        return target
-    with file_lock(target):
-        if not target.is_file():
-            images = _calibration_images()
-            with atomic_write(target) as draft:
-                quantise(path, images, draft)
+    derive([target], lambda draft: quantise(path, _calibration_images(), draft))
     return target
 
 

@@ -18,8 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from v3d_torch.errors import DownloadError, WeightsError
-from v3d_torch.io.download import cache_dir, fetch
+from v3d_torch.io.download import fetch
 from v3d_torch.io.files import atomic_write, file_lock
+from v3d_torch.io.paths import cache_dir
 
 _CONNECT_TIMEOUT = 3.0
 """Timeout of a connection, seconds; short, so that each source fails soon without a network."""

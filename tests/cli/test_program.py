@@ -1,0 +1,39 @@
+"""Start of the program: Ctrl-C while modules are imported."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from helpers.commands import assert_error_line
+
+INTERRUPT = """
+import sys
+
+class Interrupt:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r}:
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Interrupt())
+"""
+"""Code that raises the exception of Ctrl-C when a module is imported."""
+
+PROGRAM = "from v3d_torch.__main__ import main; main()"
+
+MODULE = "import runpy; runpy.run_module('v3d_torch.run', run_name='__main__', alter_sys=True)"
+
+
+@pytest.mark.parametrize(
+    ("start", "arguments"),
+    [(PROGRAM, ["run", "--seq", "demo"]), (PROGRAM, ["record", "--out", "out"]), (MODULE, ["--seq", "demo"])],
+    ids=["run", "record", "module run"],
+)
+@pytest.mark.parametrize("module", ["typer", "rich.console", "torch"])
+def test_ctrl_c_during_an_import_is_reported_as_later(module: str, start: str, arguments: list[str]) -> None:
+    code = INTERRUPT.format(module=module) + start
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
+    )
+    assert_error_line(done, "error: interrupted before the results were written\n")
