@@ -81,6 +81,12 @@ def test_table_without_visible_floor_is_taken_as_floor_only_if_nothing_is_below(
     assert floor is not None and floor.offset == pytest.approx(-0.625, abs=1e-6)
 
 
+def test_table_is_no_floor_if_its_legs_and_walls_reach_below_it() -> None:
+    table, above = box_of_voxels((0, 0, 0), (30, 1, 30)), box_of_voxels((0, -10, 0), (30, 0, 30))
+    wall = box_of_voxels((0, 4, 40), (30, 14, 41))  # no voxel below the table faces up
+    assert find_floor(map_of(torch.cat([table, wall]), above), estimate_up()) is None
+
+
 def test_ceiling_is_no_floor() -> None:
     ceiling, free = box_of_voxels((0, 0, 0), (40, 1, 40)), box_of_voxels((0, 1, 0), (40, 12, 40))
     assert find_floor(map_of(ceiling, free), estimate_up()) is None

@@ -38,7 +38,11 @@ _MIN_AREA = 0.25
 """Minimum visible area of a floor, square metres; steps and boxes are smaller."""
 
 _MAX_BELOW = 0.2
-"""Maximum number of voxels below the floor, as a fraction of the voxels of the floor: below a table there are more."""
+"""Maximum number of occupied voxels below the floor, as a fraction of the voxels of the floor: below a table there are
+more, such as its legs, walls and the floor."""
+
+_BELOW_MARGIN = 2
+"""Minimum distance of voxels that count as below the floor, voxels: the floor itself is up to three voxels high."""
 
 _REFINEMENTS = 3
 """Number of times that direction and planes are refitted to their voxels."""
@@ -92,12 +96,12 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     direction = _common_direction(normals, up)
     if direction is None:
         return None
-    points = points[normals @ direction > math.cos(_FACING_TOLERANCE)]
+    facing = points[normals @ direction > math.cos(_FACING_TOLERANCE)]
     for _ in range(_REFINEMENTS):
-        direction = _fit_normal(points, _find_levels(points @ direction, size), size, direction)
+        direction = _fit_normal(facing, _find_levels(facing @ direction, size), size, direction)
     if direction @ up.direction < math.cos(up.tolerance):
         return None
-    return _lowest_level(points @ direction, direction, size, step * size**2)
+    return _lowest_level(facing @ direction, points @ direction, direction, size, step * size**2)
 
 
 def _voxel_normals(occupancy: OccupancyMap, points: Tensor) -> Tensor:
@@ -147,11 +151,19 @@ def _fit_normal(points: Tensor, levels: list[Tensor], size: float, direction: Te
     return normal * (normal @ direction).sign() if levels else direction
 
 
-def _lowest_level(heights: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
-    """Lowest level with enough points, given their heights (N,) and the area that each point covers."""
+def _lowest_level(heights: Tensor, occupied: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
+    """Lowest level with enough voxels that face up and few occupied voxels below it.
+
+    Args:
+        heights: Heights of the voxels that face up, (N,).
+        occupied: Heights of all occupied voxels, (M,).
+        up: Up direction, (3,).
+        size: Side of a voxel, metres.
+        area: Area that each voxel covers, square metres.
+    """
     heights = heights.sort().values
     counts = _count_near(heights, heights, size)
-    below = torch.searchsorted(heights, heights - size)
+    below = torch.searchsorted(occupied.sort().values, heights - _BELOW_MARGIN * size)
     is_floor = (counts >= _MIN_VOXELS) & (counts * area >= _MIN_AREA) & (below <= _MAX_BELOW * counts)
     if not bool(is_floor.any()):
         return None
