@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from v3d_torch.pipeline.run_record import RunRecord
+from v3d_torch.runs.wall_time import describe_wall_time, do_stages_overlap
 
 _PREPROCESSING = ("read", "segmentation", "depth", "features")
 _BACK_END = ("bundle", "loop")
@@ -16,8 +17,8 @@ _BACK_END = ("bundle", "loop")
 def profile_table(run: RunRecord) -> Table:
     """Return the milliseconds per frame of each stage, and of each chain of stages that run one after the other.
 
-    The slowest chain limits the frame rate, independently of the number of processors. A stage that did not run on a
-    frame counts as 0.
+    If stages overlap, the slowest chain limits the frame rate, independently of the number of processors. A stage that
+    did not run on a frame counts as 0.
 
     Args:
         run: Record of a finished run with at least one frame.
@@ -36,10 +37,10 @@ def profile_table(run: RunRecord) -> Table:
     table.add_section()
     table.add_row("all", *_summary(wall.sum(axis=1), cpu.sum(axis=1), cpu.sum()))
     slowest = max(chains, key=lambda name: wall[:, chains[name]].sum())
-    table.caption = (
-        f"{1e3 * run.seconds / len(run.times):.1f} ms of wall time, because stages overlap; the chain that limits the"
-        f" rate is {slowest}"
-    )
+    stage_seconds = float(run.times.wall.sum())
+    table.caption = describe_wall_time(stage_seconds, run.seconds, len(run.times))
+    if do_stages_overlap(stage_seconds, run.seconds):
+        table.caption += f"; the chain that limits the rate is {slowest}"
     return table
 
 
