@@ -148,10 +148,11 @@ def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, Result]) -
     stages = wall.columns.str.removeprefix("seconds_")
     rows = [line.strip("│ ").split() for line in done.stdout.partition("time per frame, ms")[2].splitlines()]
     shown = {" ".join(row[:-10]): row[-9::2] for row in rows if len(row) > 10 and row[-1].endswith("%")}
-    preprocessing = stages.isin(["read", "segmentation", "depth", "features"])
-    back_end = stages.isin(["bundle", "loop"])
+    features, back_end = stages.isin(["read", "depth", "features"]), stages.isin(["bundle", "loop"])
+    segmentation = stages == "segmentation"
     expected = {stage: stages == stage for stage in stages}
-    expected |= {"preprocessing": preprocessing, "tracking": ~preprocessing & ~back_end, "back end": back_end}
+    expected |= {"chain: features": features, "chain: segmentation": segmentation, "chain: back end": back_end}
+    expected |= {"chain: tracking": ~features & ~segmentation & ~back_end}
     expected |= {"all": np.ones(len(stages), np.bool_)}
     assert list(shown) == list(expected)
     for name, members in expected.items():

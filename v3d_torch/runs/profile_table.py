@@ -9,9 +9,13 @@ from rich.table import Table
 from v3d_torch.pipeline.run_record import RunRecord
 from v3d_torch.runs.wall_time import describe_wall_time, do_stages_overlap
 
-_PREPROCESSING = ("read", "segmentation", "depth", "features")
-_BACK_END = ("bundle", "loop")
-"""Stages that run in parallel with tracking; all other stages of a frame run one after the other."""
+_CHAINS = {
+    "features": ("read", "depth", "features"),
+    "segmentation": ("segmentation",),
+    "back end": ("bundle", "loop"),
+}
+"""Stages of each thread that runs in parallel with tracking, see `FramePrefetcher` and `BackEnd`; all other stages run
+one after the other."""
 
 
 def profile_table(run: RunRecord) -> Table:
@@ -30,10 +34,11 @@ def profile_table(run: RunRecord) -> Table:
     for index, stage in enumerate(stages):
         table.add_row(stage, *_summary(wall[:, index], cpu[:, index], cpu.sum()))
     table.add_section()
-    preprocessing, back_end = np.isin(stages, _PREPROCESSING), np.isin(stages, _BACK_END)
-    chains = {"preprocessing": preprocessing, "tracking": ~preprocessing & ~back_end, "back end": back_end}
+    chains = {name: np.isin(stages, members) for name, members in _CHAINS.items()}
+    chains["tracking"] = ~np.any(list(chains.values()), axis=0)
     for name, members in chains.items():
-        table.add_row(name, *_summary(wall[:, members].sum(axis=1), cpu[:, members].sum(axis=1), cpu.sum()))
+        summary = _summary(wall[:, members].sum(axis=1), cpu[:, members].sum(axis=1), cpu.sum())
+        table.add_row(f"chain: {name}", *summary)
     table.add_section()
     table.add_row("all", *_summary(wall.sum(axis=1), cpu.sum(axis=1), cpu.sum()))
     slowest = max(chains, key=lambda name: wall[:, chains[name]].sum())
