@@ -262,7 +262,8 @@ def test_wall_time_is_compared_with_the_sum_of_the_stages(copy: Path, seconds: f
     metrics = json.loads((copy / "metrics.json").read_text())
     metrics |= {"processed": 10, "seconds": seconds, "seconds_per_stage": {"read": 0.25, "tracking": 0.75}}
     write_text(copy / "metrics.json", json.dumps(metrics))
-    assert expected in " ".join(page_of(copy).text.split())
+    text = " ".join(page_of(copy).text.split())
+    assert expected in text and "total, s percentage of wall time" in text
 
 
 @pytest.mark.usefixtures("without_plots")

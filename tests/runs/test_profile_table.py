@@ -35,6 +35,10 @@ def test_overlapping_stages_name_the_chain_that_limits_the_rate() -> None:
     assert "chain: tracking │ 10.0" in text and "chain: back end │ 2.0" in text
 
 
+def test_heading_of_the_fraction_names_the_time() -> None:
+    assert "┃ CPU ┃ fraction of CPU ┃" in printed(0.04)
+
+
 def test_stages_in_turn_tell_the_time_outside_of_them() -> None:
     text = printed(0.0885)
     assert "88.5 ms of wall time per frame, of which 21.5 ms outside the stages" in text

@@ -29,7 +29,7 @@ def profile_table(run: RunRecord) -> Table:
     """
     stages, wall, cpu = run.times.stages, 1e3 * run.times.wall.numpy(), 1e3 * run.times.cpu.numpy()
     table = Table(title="time per frame, ms")
-    for heading in ("stage", "wall", "median", "95%", "CPU", "fraction"):
+    for heading in ("stage", "wall", "median", "95%", "CPU", "fraction of CPU"):
         table.add_column(heading, justify="left" if heading == "stage" else "right")
     for index, stage in enumerate(stages):
         table.add_row(stage, *_summary(wall[:, index], cpu[:, index], cpu.sum()))
