@@ -137,7 +137,7 @@ def test_run_prints_scores_and_result_folder(
 ) -> None:
     out, done = first_run
     assert done.stderr == ""
-    for words in ("ATE rmse", "30 of 30", "30 tracked", f"results: {out}"):
+    for words in ("ATE rmse", "(coverage 100.0%)", "30 of 30", "30 tracked", f"results: {out}"):
         assert words in done.stdout
 
 

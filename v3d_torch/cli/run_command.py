@@ -18,6 +18,7 @@ from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.evaluation import format_coverage
 from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
@@ -272,7 +273,8 @@ def _summary_table(
         table.add_row("dropped", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
-        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")
+        coverage = "" if evaluation.coverage is None else f" (coverage {format_coverage(evaluation.coverage)})"
+        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m{coverage}")
         if evaluation.rpe is not None:
             table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
     if (masks := record.mask_evaluation.compute_scores()) is not None:
