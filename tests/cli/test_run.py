@@ -137,6 +137,12 @@ def test_run_prints_scores_and_result_folder(
 ) -> None:
     out, done = first_run
     assert done.stderr == ""
+    objects = pd.read_parquet(out / "dynamics.parquet")
+    summary = done.stdout.partition("time per frame")[0].splitlines()
+    shown = {row[1].strip(): row[2].strip() for line in summary if len(row := line.split("│")) > 3}
+    assert shown["objects"] == str(objects["id"].nunique())
+    counts = objects["motion_state"].value_counts()
+    assert set(shown["frames of objects"].split(", ")) == {f"{count} {state}" for state, count in counts.items()}
     for words in ("ATE rmse", "(coverage 100.0%)", "30 of 30", "30 tracked", f"results: {out}"):
         assert words in done.stdout
 

@@ -265,7 +265,9 @@ def _summary_table(
     table.add_row("keyframes, loops", f"{len(active) - known}, {slam.loop_closer.loop_count}")
     if request.load_map is not None:
         table.add_row("loaded map", f"{known} {'keyframe' if known == 1 else 'keyframes'} left")
-    table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
+    table.add_row("objects", str(record.dynamics.count_objects()))
+    if motion_states:
+        table.add_row("frames of objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()))
     if (latency := record.live.latency_statistics()) is not None:
         text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
         table.add_row("latency", text)

@@ -138,8 +138,12 @@ class ObjectTable(TensorTable):
             missed=torch.tensor([each.missed for each in objects]),
         )
 
+    def count_objects(self) -> int:
+        """Return the number of different objects."""
+        return len(self["id"].unique())
+
     def count_motion_states(self) -> dict[MotionState, int]:
-        """Return the number of rows with each motion state, in the order of their first row."""
+        """Return the number of rows, frames times objects, with each motion state, in the order of their first row."""
         return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
 
 
