@@ -222,7 +222,7 @@ class RunRecord:
         most_dynamic_snapshot: Frame with the most votes for dynamic objects; of several, that with the most objects.
         mask_evaluation: Comparison of the masks with true masks.
         broken: Broken frames that were skipped.
-        seconds: Wall time of all frames, seconds.
+        seconds: Wall time of all frames without the comparison with true masks, seconds.
         failure: Reason why the run ended before the end of the sequence; None if it did not.
         diagnosis: Cause of incomplete results of a run that reached the end of the sequence; None if they are complete.
         interrupted: True if the user interrupted the run.
