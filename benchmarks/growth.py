@@ -113,7 +113,7 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
         "frames": str(frames),
         "cpu_ms": ", ".join(cpu_ms),
         "memory_mb": f"{early.resident_mb:.0f} to {late.resident_mb:.0f}",
-        "memory_kb_per_frame": f"{1024 * (late.resident_mb - early.resident_mb) / later:.0f}",
+        "memory_kb_per_frame": f"{1e3 * (late.resident_mb - early.resident_mb) / later:.0f}",
         "keyframes": f"{min(end.keyframes for end in ends)} to {max(end.keyframes for end in ends)}",
         "loops": str(late.loops),
     }
@@ -121,8 +121,8 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
 
 
 def resident_mb() -> float:
-    """Return the memory of this process, MiB."""
-    return psutil.Process().memory_info().rss / 2**20
+    """Return the memory of this process, megabytes."""
+    return psutil.Process().memory_info().rss / 1e6
 
 
 def measure_keyframes(max_count: int) -> Iterator[Row]:

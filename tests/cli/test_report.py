@@ -252,6 +252,22 @@ def test_frames_that_were_not_tracked_are_counted_by_status(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_plots")
+@pytest.mark.parametrize(
+    ("seconds", "expected"),
+    [
+        (0.5, "50.0 ms of wall time per frame, less than the sum of the stages, because stages overlap."),
+        (1.5, "150.0 ms of wall time per frame, of which 50.0 ms outside the stages."),
+    ],
+)
+def test_wall_time_is_compared_with_the_sum_of_the_stages(copy: Path, seconds: float, expected: str) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    metrics |= {"processed": 10, "seconds": seconds, "seconds_per_stage": {"read": 0.25, "tracking": 0.75}}
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    text = " ".join(page_of(copy).text.split())
+    assert expected in text and "total, s percentage of wall time" in text
+
+
+@pytest.mark.usefixtures("without_plots")
 def test_page_of_run_without_objects(tmp_path: Path) -> None:
     run_into(tmp_path, Wall(broken=4), lambda _: Instances.empty(240, 320), "segmentation.source=none")
     page = page_of(tmp_path)

@@ -155,7 +155,13 @@ def test_run_prints_scores_and_result_folder(
 ) -> None:
     out, done = first_run
     assert done.stderr == ""
-    for words in ("ATE rmse", "30 of 30", "30 tracked", f"results: {out}"):
+    objects = pd.read_parquet(out / "dynamics.parquet")
+    summary = done.stdout.partition("time per frame")[0].splitlines()
+    shown = {row[1].strip(): row[2].strip() for line in summary if len(row := line.split("│")) > 3}
+    assert shown["objects"] == str(objects["id"].nunique())
+    counts = objects["motion_state"].value_counts()
+    assert set(shown["frames of objects"].split(", ")) == {f"{count} {state}" for state, count in counts.items()}
+    for words in ("ATE rmse", "(coverage 100.0%)", "30 of 30", "30 tracked", f"results: {out}"):
         assert words in done.stdout
 
 
@@ -166,10 +172,11 @@ def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, Result]) -
     stages = wall.columns.str.removeprefix("seconds_")
     rows = [line.strip("│ ").split() for line in done.stdout.partition("time per frame, ms")[2].splitlines()]
     shown = {" ".join(row[:-10]): row[-9::2] for row in rows if len(row) > 10 and row[-1].endswith("%")}
-    preprocessing = stages.isin(["read", "segmentation", "depth", "features"])
-    back_end = stages.isin(["bundle", "loop"])
+    features, back_end = stages.isin(["read", "depth", "features"]), stages.isin(["bundle", "loop"])
+    segmentation = stages == "segmentation"
     expected = {stage: stages == stage for stage in stages}
-    expected |= {"preprocessing": preprocessing, "tracking": ~preprocessing & ~back_end, "back end": back_end}
+    expected |= {"chain: features": features, "chain: segmentation": segmentation, "chain: back end": back_end}
+    expected |= {"chain: tracking": ~features & ~segmentation & ~back_end}
     expected |= {"all": np.ones(len(stages), np.bool_)}
     assert list(shown) == list(expected)
     for name, members in expected.items():
@@ -177,8 +184,8 @@ def test_profile_prints_the_time_of_each_stage(first_run: tuple[Path, Result]) -
         figures = [taken.mean(), np.median(taken), np.quantile(taken, 0.95), used.mean()]
         assert list(map(float, shown[name][:4])) == pytest.approx(figures, abs=0.06)  # printed with one decimal
         assert float(shown[name][4].rstrip("%")) == pytest.approx(100 * used.sum() / cpu.to_numpy().sum(), abs=0.6)
-    slowest = max(("preprocessing", "tracking", "back end"), key=lambda name: wall.loc[:, expected[name]].sum().sum())
-    assert f"the rate is {slowest}" in " ".join(done.stdout.split())
+    frame_rate = 1e3 / json.loads((out / "metrics.json").read_text())["fps"]
+    assert f"{frame_rate:.1f} ms of wall time per frame" in " ".join(done.stdout.split())
 
 
 def test_saved_masks_are_binary_and_named_by_timestamp(first_out: Path, sequence: Path) -> None:

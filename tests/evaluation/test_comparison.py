@@ -10,6 +10,7 @@ from scipy import stats
 
 from v3d_torch.evaluation.comparison import ALL_SEQUENCES, compare_configurations, mean_ratio
 from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.evaluation.tables import format_markdown_table
 
 
 def run(sequence: str, config: str, seed: int, ate: float | None, difference: str | None = None) -> Outcome:
@@ -55,7 +56,9 @@ def test_runs_with_the_same_sequence_and_seed_are_compared() -> None:
         "c (part: 6 of 8 frames)": ["9.000", "-"],
         ALL_SEQUENCES: ["2.828 [0.035-231.217]", "-"],
     }
-    assert [table.rows[name][0].best for name in ("a", "b", ALL_SEQUENCES)] == [True, False, False]
+    marks = [(table.rows[name][0].best, table.rows[name][0].worse) for name in ("a", "b", ALL_SEQUENCES)]
+    assert marks == [(False, True), (False, False), (False, False)]
+    assert format_markdown_table(table)[5:7] == ["| a | **2.000 [2.000-2.000]** | - |", "| b | 4.000 | - |"]
 
 
 @pytest.mark.parametrize("outcomes", [[], [run("a", "full", 0, 0.1)], [run("a", "x", 0, 0.1), run("a", "y", 1, 0.1)]])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource
-from v3d_torch.evaluation.evaluation import absent_scores
+from v3d_torch.evaluation.evaluation import absent_scores, format_coverage
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
 
@@ -104,6 +104,14 @@ def test_timestamps_in_another_unit_are_named(factor: float, unit: str) -> None:
     for groundtruth, estimate, name in ((seconds, counts, "estimate"), (counts, seconds, "ground truth")):
         with pytest.raises(InputError, match=f"needed; the timestamps of the {name} seem to be in {unit}, write them"):
             evaluate(groundtruth, estimate)
+
+
+@pytest.mark.parametrize(
+    ("coverage", "text"),
+    [(1.0, "100.0%"), (1 - 1e-6, "99.9%"), (693 / 694, "99.8%"), (0.9, "90.0%"), (0.29, "29.0%"), (0.0, "0.0%")],
+)
+def test_coverage_is_rounded_down(coverage: float, text: str) -> None:
+    assert format_coverage(coverage) == text
 
 
 def test_coverage_and_json_values() -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import csv
 import os
 import re
+from io import StringIO
 from typing import Any
 
 import pytest
 from rich.console import Console
+from rich.text import Text
 
 from v3d_torch.datasets import PAPER_SEQUENCES, short_name
 from v3d_torch.evaluation.outcome import Outcome, label_sequence
@@ -166,6 +168,22 @@ def test_screen_table_fits_and_brackets_are_not_markup() -> None:
     for words in ("my & [own]", "[0.0100-0.0151]", "V3D-SLAM", "1 failed", "RPE, deg/s"):
         assert words in text
     assert "…" not in text and "DynaSLAM" not in text
+
+
+@pytest.mark.parametrize(("factor", "colour"), [(0.5, "32"), (2.0, "35")])  # green, magenta
+def test_screen_explains_brackets_and_colours_below_the_tables(factor: float, colour: str) -> None:
+    outcomes = [*runs("demo", "full", 0.1, 0.2, 0.3), *runs("demo", "fast", *(factor * x for x in (0.1, 0.2, 0.3)))]
+    file = StringIO()
+    console = Console(width=80, soft_wrap=True, force_terminal=True, color_system="standard", file=file)
+    for shown in make_screen_tables(outcomes):
+        console.print(shown)
+    written = file.getvalue()
+    assert f"\x1b[1;{colour}m{factor:.3f}" in written
+    errors, _, ratios = Text.from_ansi(written).plain.partition("relative to full")
+    assert "median and [range] over the seeds" in errors
+    assert "geometric mean and [95 % interval] over the seeds" in " ".join(ratios.split())
+    assert "Green: errors are smaller; magenta: larger." in " ".join(ratios.split())
+    assert max(map(len, ratios.splitlines())) <= 80
 
 
 def test_part_of_a_sequence_is_marked_in_all_tables() -> None:

@@ -72,7 +72,7 @@ def differences(a: Any, b: Any, path: str, compared: dict[int, Any]) -> Iterator
         compared[id(a)] = a, b
         cached = {name for name in dir(type(a)) if isinstance(getattr(type(a), name, None), cached_property)}
         # Measured times, and the threads of a pipeline with prefetching.
-        skipped = cached | {"timer", "_thread", "_executor", "_get_result"}
+        skipped = cached | {"timer", "_stopwatch", "_thread", "_executor", "_get_result"}
         if not isinstance(a, Readout):  # its seconds are not the time of a stage
             skipped.add("seconds")
         first, second = ({key: value for key, value in vars(x).items() if key not in skipped} for x in (a, b))

@@ -81,6 +81,22 @@ def test_table_without_visible_floor_is_taken_as_floor_only_if_nothing_is_below(
     assert floor is not None and floor.offset == pytest.approx(-0.625, abs=1e-6)
 
 
+def test_table_is_no_floor_if_its_legs_and_walls_reach_below_it() -> None:
+    table, above = box_of_voxels((0, 0, 0), (30, 1, 30)), box_of_voxels((0, -10, 0), (30, 0, 30))
+    wall = box_of_voxels((0, 4, 40), (30, 14, 41))  # no voxel below the table faces up
+    assert find_floor(map_of(torch.cat([table, wall]), above), estimate_up()) is None
+
+
+def test_desk_and_things_of_almost_the_same_height_do_not_tilt_the_up_direction() -> None:
+    """The tops of a chair, a desk with a book on it, and a cupboard differ by a voxel each."""
+    tops = {(-22, 1, 2): (-2, 14), (10, 0, 0): (30, 16), (42, -1, 0): (62, 12), (0, 15, 0): (8, 30)}
+    occupied = [box_of_voxels((x, y, z), (last_x, y + 1, last_z)) for (x, y, z), (last_x, last_z) in tops.items()]
+    free = [box_of_voxels((x, y - 8, z), (last_x, y, last_z)) for (x, y, z), (last_x, last_z) in tops.items()]
+    book = box_of_voxels((20, -1, 6), (24, 0, 9))
+    floor = find_floor(map_of(torch.cat([*occupied, book]), torch.cat(free)), estimate_up())
+    assert floor is not None and angle(floor.up, UP) < 0.2 and floor.offset == pytest.approx(-0.775, abs=0.02)
+
+
 def test_ceiling_is_no_floor() -> None:
     ceiling, free = box_of_voxels((0, 0, 0), (40, 1, 40)), box_of_voxels((0, 1, 0), (40, 12, 40))
     assert find_floor(map_of(ceiling, free), estimate_up()) is None

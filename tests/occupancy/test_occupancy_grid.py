@@ -169,6 +169,13 @@ def test_map_server_reads_the_states_from_the_files(chosen: OccupancyGrid, tmp_p
     assert np.array_equal(states[::-1], chosen.states.numpy())  # the last row of the image has the smallest y
 
 
+def test_origin_is_written_without_rounding_errors(tmp_path: Path) -> None:
+    grid = occupancy_grid(map_of(torch.tensor([[-4, -5, -4]]), torch.zeros(0, 3, dtype=torch.int64)), FLOOR, HEIGHTS)
+    write_map_server_files(tmp_path / "map.yaml", grid)
+    assert "origin: [-0.2, 0.15, 0.0]\n" in (tmp_path / "map.yaml").read_text()
+    assert grid.origin[0] == -0.2  # in double precision, as the coordinates of the cells
+
+
 def test_error_names_the_file_that_cannot_be_written(chosen: OccupancyGrid, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"map\.pgm: cannot be written"):

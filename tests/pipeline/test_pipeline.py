@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +17,7 @@ import torch
 from helpers import walls
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
 from helpers.walls import Slide
+from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
@@ -56,6 +58,18 @@ def test_callback_and_record_have_every_frame_and_object() -> None:
     assert len(record.snapshots) == 6
     assert set(pipeline.slam.timer.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
     assert max(pipeline.slam.timer.seconds.values()) <= record.seconds
+
+
+def test_time_of_the_run_does_not_contain_the_comparison_with_true_masks() -> None:
+    class MaskedWall(Wall):
+        def motion_mask(self, index: int) -> Tensor:
+            time.sleep(0.05)
+            return torch.zeros(240, 320, dtype=torch.uint8)
+
+    begin = time.perf_counter()
+    record = make_pipeline(MaskedWall())()
+    assert record.mask_evaluation.compute_scores() is not None
+    assert 0 < record.seconds < time.perf_counter() - begin - 0.05 * FRAMES
 
 
 def test_snapshots_of_a_stream_that_drops_frames_reach_from_its_first_to_its_last_frames() -> None:

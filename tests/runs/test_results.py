@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import math
+import re
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -88,6 +90,13 @@ def test_metrics_have_the_documented_keys(results: Path, run: Pipeline) -> None:
     assert 50 < metrics["peak_memory_mb"] < 20_000
     assert metrics["seed"] == 0 and metrics["versions"]["torch"] == torch.__version__
     assert max(metrics["seconds_per_stage"].values()) <= metrics["seconds"]  # stages overlap
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the memory from /proc")
+def test_peak_memory_is_in_millions_of_bytes() -> None:
+    peak = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
+    assert peak is not None
+    assert results_module._peak_memory_mb() == pytest.approx(1024 * int(peak[1]) / 1e6, rel=0.01)
 
 
 def test_library_of_another_distribution_has_no_version(

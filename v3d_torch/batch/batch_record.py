@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from rich.table import Table
+from rich.console import RenderableType
 
 from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
@@ -109,8 +109,8 @@ class BatchRecord:
         write_text(self.folder / "summary.tex", format_latex(self.outcomes))
         write_text(self.folder / "summary.csv", format_csv(self.outcomes))
 
-    def screen_tables(self) -> list[Table]:
-        """Return the summary as tables for the screen."""
+    def screen_tables(self) -> list[RenderableType]:
+        """Return the summary as tables for the screen, and their explanations."""
         return make_screen_tables(self.outcomes)
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
+from rich.console import Console, RenderableType
 
 from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.job import Job
@@ -29,7 +28,7 @@ from v3d_torch.evaluation.summary import (
     format_markdown,
     make_screen_tables,
 )
-from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_table
+from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_legend, make_screen_table
 from v3d_torch.io.files import write_text
 from v3d_torch.runs.open_sequences import open_sequence
 from v3d_torch.runs.print_line import print_line
@@ -132,11 +131,12 @@ class ReproductionRecord(BatchRecord):
             )
             write_text(self.folder / "ablation.csv", ablation.format_csv(self._study_outcomes))
 
-    def screen_tables(self) -> list[Table]:
-        """Return the paper's tables and that of the study for the screen."""
-        table = ablation.make_overview_table(self._study_outcomes, self._absent)
+    def screen_tables(self) -> list[RenderableType]:
+        """Return the paper's tables and that of the study for the screen, and their explanations."""
         shown = make_screen_tables(self._table_outcomes, self._absent)
-        return [*shown, *([make_screen_table(table)] if table is not None else [])]
+        if (table := ablation.make_overview_table(self._study_outcomes, self._absent)) is not None:
+            shown += [make_screen_table(table), make_screen_legend(ablation.RATIO_LEGEND)]
+        return shown
 
 
 def describe_missing(missing: Sequence[str], folder: Path, reason: str | None) -> str:

@@ -81,9 +81,10 @@ def _error_table(evaluation: Evaluation) -> Table:
 
     from rich.table import Table
 
+    from v3d_torch.evaluation.evaluation import format_coverage
     from v3d_torch.evaluation.statistics import Statistics
 
-    coverage = f", {evaluation.coverage:.1%} of the frames" if evaluation.coverage is not None else ""
+    coverage = f", {format_coverage(evaluation.coverage)} of the frames" if evaluation.coverage is not None else ""
     rows = {"ATE, m": evaluation.ate}
     if (rpe := evaluation.rpe) is not None:
         delta = "s" if rpe.delta == 1 else f"{rpe.delta:g} s"

@@ -18,6 +18,7 @@ from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
+from v3d_torch.evaluation.evaluation import format_coverage
 from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
@@ -267,7 +268,9 @@ def _summary_table(
     table.add_row("keyframes, loops", f"{len(active) - known}, {slam.loop_closer.loop_count}")
     if request.load_map is not None:
         table.add_row("loaded map", f"{known} {'keyframe' if known == 1 else 'keyframes'} left")
-    table.add_row("objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()) or "none")
+    table.add_row("objects", str(record.dynamics.count_objects()))
+    if motion_states:
+        table.add_row("frames of objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()))
     if (latency := record.live.latency_statistics()) is not None:
         text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
         table.add_row("latency", text)
@@ -275,7 +278,8 @@ def _summary_table(
         table.add_row("dropped", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
     if evaluation is not None:
-        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m (coverage {evaluation.coverage:.0%})")
+        coverage = "" if evaluation.coverage is None else f" (coverage {format_coverage(evaluation.coverage)})"
+        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m{coverage}")
         if evaluation.rpe is not None:
             table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
     if (masks := record.mask_evaluation.compute_scores()) is not None:

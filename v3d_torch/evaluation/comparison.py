@@ -73,7 +73,7 @@ def compare_configurations(outcomes: Sequence[Outcome], key: str, heading: str) 
         heading: Name of the error.
 
     Returns:
-        Table of ratios, significant ones marked as the best; None if there are too few runs for an interval.
+        Table of ratios, significant ones marked as best or worse; None if there are too few runs for an interval.
     """
     configs = list(dict.fromkeys(outcome.config for outcome in outcomes))
     reference, others = configs[0] if configs else "", configs[1:]
@@ -115,4 +115,4 @@ def _cell(ratios: Sequence[float]) -> Cell:
     if not ratios:
         return Cell("-", best=False)
     ratio = mean_ratio(ratios)
-    return Cell(str(ratio), best=ratio.is_significant)
+    return Cell(str(ratio), best=ratio.high < 1, worse=ratio.low > 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -133,6 +134,16 @@ def absent_scores(poses: int, frames: int | None) -> dict[str, Any]:
     """
     absent = dict.fromkeys(("ate", "rpe", "alignment"))
     return {**absent, "pairs": 0, "poses": poses, "coverage": _coverage(poses, frames), "notes": []}
+
+
+def format_coverage(coverage: float) -> str:
+    """Format a coverage as a percentage with one decimal, rounded down, so that 100.0% are all frames.
+
+    Args:
+        coverage: Coverage, see `Evaluation`.
+    """
+    thousandths = math.floor(round(1e3 * coverage, 6))  # rounded, because 0.29 has no exact value
+    return f"{thousandths / 10:.1f}%"
 
 
 def has_orientations(trajectory: Trajectory) -> bool:

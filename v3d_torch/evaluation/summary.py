@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from io import StringIO
 from statistics import median
 
-from rich.table import Table
+from rich.console import RenderableType
 
 from v3d_torch.datasets.sequence_names import find_paper_sequence
 from v3d_torch.evaluation.comparison import compare_configurations
@@ -21,6 +21,7 @@ from v3d_torch.evaluation.tables import (
     format_lowest,
     format_markdown_table,
     format_median_and_range,
+    make_screen_legend,
     make_screen_table,
 )
 
@@ -42,6 +43,8 @@ RATIO_LEGEND = (
     " difference, one of twenty is."
 )
 """Explanation of the tables of ratios."""
+
+_RATIO_COLOURS = "Green: errors are smaller; magenta: larger."
 
 _FORMAT = ".4f"
 _PAPER_SUFFIX = " (paper)"
@@ -122,14 +125,18 @@ def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     return text.getvalue()
 
 
-def make_screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[Table]:
-    """Return the tables for the screen, with the first and the last method of the paper.
+def make_screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[RenderableType]:
+    """Return the tables for the screen, with the first and the last method of the paper, and their explanations.
 
     See `make_error_tables` and `make_ratio_tables`.
     """
-    errors = make_error_tables(outcomes, _SCREEN_METHODS, absent)
-    tables = [replace(table, heading=f"{table.heading}, RMSE") for table in errors] + make_ratio_tables(outcomes)
-    return [make_screen_table(table) for table in tables]
+    shown: list[RenderableType] = []
+    if errors := make_error_tables(outcomes, _SCREEN_METHODS, absent):
+        shown += [make_screen_table(replace(table, heading=f"{table.heading}, RMSE")) for table in errors]
+        shown.append(make_screen_legend(LEGEND))
+    if ratios := make_ratio_tables(outcomes):
+        shown += [*map(make_screen_table, ratios), make_screen_legend(f"{RATIO_LEGEND} {_RATIO_COLOURS}")]
+    return shown
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,9 @@ from typing import NamedTuple
 
 from rich import box
 from rich.markup import escape
+from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
 
 class Cell(NamedTuple):
@@ -17,11 +19,23 @@ class Cell(NamedTuple):
 
     Attributes:
         text: Text of the cell.
-        best: True if the value is the best of the compared values.
+        best: True if the value is the best of the compared values, or significantly better than a reference.
+        worse: True if it is significantly worse than the reference.
     """
 
     text: str
     best: bool
+    worse: bool = False
+
+    @property
+    def is_bold(self) -> bool:
+        """True if the cell is bold where tables have no colours."""
+        return self.best or self.worse
+
+    @property
+    def style(self) -> str:
+        """Style on the screen. Colour-blind people can tell green and magenta apart, but not green and red."""
+        return "bold green" if self.best else "bold magenta" if self.worse else ""
 
 
 @dataclass(frozen=True)
@@ -57,22 +71,27 @@ def format_lowest(values: Iterable[float], form: str) -> str:
     return format(min(values), form)
 
 
+def make_screen_legend(legend: str) -> Padding:
+    """Return the explanation of tables for the screen, wrapped at spaces also on a console that does not wrap."""
+    return Padding(Text(legend, no_wrap=False, overflow="fold"), (0, 0, 1, 0), expand=False)
+
+
 def markdown_row(cells: Sequence[str]) -> str:
     """Format a row of a Markdown table."""
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
 def format_markdown_table(table: ErrorTable) -> list[str]:
-    """Return the lines of a Markdown section with the table, the best values in bold."""
+    """Return the lines of a Markdown section with the table, marked values in bold."""
     lines = ["", f"## {table.heading}", "", markdown_row(["sequence", *table.methods])]
     lines.append(markdown_row(["---", *["---:"] * len(table.methods)]))
     for sequence, cells in table.rows.items():
-        lines.append(markdown_row([sequence, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
+        lines.append(markdown_row([sequence, *(f"**{cell.text}**" if cell.is_bold else cell.text for cell in cells)]))
     return lines
 
 
 def format_latex_table(table: ErrorTable, legend: str) -> list[str]:
-    """Return the lines of a LaTeX table, the best values in bold. It requires the package booktabs."""
+    """Return the lines of a LaTeX table, marked values in bold. It requires the package booktabs."""
     lines = [
         "\\begin{table*}",
         "  \\centering",
@@ -84,13 +103,13 @@ def format_latex_table(table: ErrorTable, legend: str) -> list[str]:
     ]
     for sequence, cells in table.rows.items():
         texts = [_escape_latex(cell.text).replace("-", "--") for cell in cells]
-        bold = [f"\\textbf{{{t}}}" if cell.best else t for t, cell in zip(texts, cells, strict=True)]
+        bold = [f"\\textbf{{{t}}}" if cell.is_bold else t for t, cell in zip(texts, cells, strict=True)]
         lines.append(f"    {_latex_row([_escape_latex(sequence), *bold])}")
     return [*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table*}"]
 
 
 def make_screen_table(table: ErrorTable) -> Table:
-    """Return the table for the screen, the best values in green."""
+    """Return the table for the screen, the best values in green, and those that are significantly worse in magenta."""
     shown = Table(title=table.heading, box=box.SIMPLE_HEAD)
     shown.add_column("sequence", no_wrap=True)
     for method in table.methods:
@@ -98,7 +117,7 @@ def make_screen_table(table: ErrorTable) -> Table:
     for sequence, cells in table.rows.items():
         # Put the range below the median, and the number of failed runs below the range.
         texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
-        marked = [f"[bold green]{t}[/]" if cell.best else t for t, cell in zip(texts, cells, strict=True)]
+        marked = [f"[{cell.style}]{t}[/]" if cell.style else t for t, cell in zip(texts, cells, strict=True)]
         shown.add_row(escape(sequence.replace(" (", "\n(")), *marked)
     return shown
 

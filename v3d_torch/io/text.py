@@ -7,7 +7,7 @@ from pathlib import Path
 
 from v3d_torch.errors import InputError
 
-_MAX_LENGTH = 100 << 20
+_MAX_LENGTH = 100_000_000
 """Maximum length of a text that is read, characters: more than an hour of poses at 200 Hz; it ends endless devices."""
 
 
@@ -63,7 +63,8 @@ def read_text(path: Path, expected: str) -> str:
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: is not a UTF-8 text file; convert it to UTF-8 ({expected})") from error
     if len(text) > _MAX_LENGTH:
-        raise InputError(f"{path}: is larger than {_MAX_LENGTH >> 20} MB; check that it is the right file ({expected})")
+        limit = f"{_MAX_LENGTH / 1e6:.0f} MB"
+        raise InputError(f"{path}: is larger than {limit}; check that it is the right file ({expected})")
     return text
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from v3d_torch.geometry.long_products import sum_products
+from v3d_torch.objects.dbscan import dbscan
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.occupancy.up_direction import UpDirection
 
@@ -38,7 +39,15 @@ _MIN_AREA = 0.25
 """Minimum visible area of a floor, square metres; steps and boxes are smaller."""
 
 _MAX_BELOW = 0.2
-"""Maximum number of voxels below the floor, as a fraction of the voxels of the floor: below a table there are more."""
+"""Maximum number of occupied voxels below the floor, as a fraction of the voxels of the floor: below a table there are
+more, such as its legs, walls and the floor."""
+
+_BELOW_MARGIN = 2
+"""Minimum distance of voxels that count as below the floor, voxels: the floor itself is up to three voxels high."""
+
+_MAX_GAP = 3
+"""Maximum gap between the voxels of one surface, voxels; times the square root of the step of a subsample, which thins
+surfaces."""
 
 _REFINEMENTS = 3
 """Number of times that direction and planes are refitted to their voxels."""
@@ -74,9 +83,10 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     """Find the floor of a map.
 
     The up direction is the normal with which most other normals agree: the normals of floor, tables and ceiling are
-    parallel. Then the levels with the most voxels that face up are found, and parallel planes are fitted to all levels,
-    because often only a small part of the floor is visible. The floor is the lowest level that is large enough and has
-    few voxels below it. All voxels are hypotheses, so the result is deterministic.
+    parallel. Then the levels with the most voxels that face up are found, and parallel planes are fitted to the
+    connected surfaces of all levels, because often only a small part of the floor is visible. The floor is the lowest
+    level that is large enough and has few occupied voxels below it. All voxels are hypotheses, so the result is
+    deterministic.
 
     Args:
         occupancy: Occupancy map.
@@ -92,12 +102,14 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     direction = _common_direction(normals, up)
     if direction is None:
         return None
-    points = points[normals @ direction > math.cos(_FACING_TOLERANCE)]
+    facing = points[normals @ direction > math.cos(_FACING_TOLERANCE)]
     for _ in range(_REFINEMENTS):
-        direction = _fit_normal(points, _find_levels(points @ direction, size), size, direction)
+        levels = _find_levels(facing @ direction, size)
+        surfaces = [surface for level in levels for surface in _split(facing[level], _MAX_GAP * size * math.sqrt(step))]
+        direction = _fit_normal(surfaces, size, direction)
     if direction @ up.direction < math.cos(up.tolerance):
         return None
-    return _lowest_level(points @ direction, direction, size, step * size**2)
+    return _lowest_level(facing @ direction, points @ direction, direction, size, step * size**2)
 
 
 def _voxel_normals(occupancy: OccupancyMap, points: Tensor) -> Tensor:
@@ -137,21 +149,36 @@ def _find_levels(heights: Tensor, size: float) -> list[Tensor]:
     return levels
 
 
-def _fit_normal(points: Tensor, levels: list[Tensor], size: float, direction: Tensor) -> Tensor:
-    """Common normal of the planes through the points (N, 3) of each level."""
-    scatter = size**2 * torch.eye(3, dtype=points.dtype)
-    for level in levels:
-        centred = points[level] - points[level].mean(dim=0)
+def _split(level: Tensor, gap: float) -> list[Tensor]:
+    """Split the points (N, 3) of a level into connected surfaces, (M, 3) each: tables can differ by a voxel."""
+    labels = dbscan(level[None], torch.ones(1, len(level), dtype=torch.bool), gap, min_samples=1)[0]
+    surfaces = [level[labels == label] for label in labels.unique()]
+    return [surface for surface in surfaces if len(surface) >= _MIN_VOXELS]
+
+
+def _fit_normal(surfaces: list[Tensor], size: float, direction: Tensor) -> Tensor:
+    """Common normal of the planes through the points, (M, 3) each, of each surface."""
+    scatter = size**2 * torch.eye(3, dtype=direction.dtype)
+    for surface in surfaces:
+        centred = surface - surface.mean(dim=0)
         scatter = scatter + sum_products(centred, centred)
     normal = torch.linalg.eigh(scatter).eigenvectors[:, 0]
-    return normal * (normal @ direction).sign() if levels else direction
+    return normal * (normal @ direction).sign() if surfaces else direction
 
 
-def _lowest_level(heights: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
-    """Lowest level with enough points, given their heights (N,) and the area that each point covers."""
+def _lowest_level(heights: Tensor, occupied: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
+    """Lowest level with enough voxels that face up and few occupied voxels below it.
+
+    Args:
+        heights: Heights of the voxels that face up, (N,).
+        occupied: Heights of all occupied voxels, (M,).
+        up: Up direction, (3,).
+        size: Side of a voxel, metres.
+        area: Area that each voxel covers, square metres.
+    """
     heights = heights.sort().values
     counts = _count_near(heights, heights, size)
-    below = torch.searchsorted(heights, heights - size)
+    below = torch.searchsorted(occupied.sort().values, heights - _BELOW_MARGIN * size)
     is_floor = (counts >= _MIN_VOXELS) & (counts * area >= _MIN_AREA) & (below <= _MAX_BELOW * counts)
     if not bool(is_floor.any()):
         return None

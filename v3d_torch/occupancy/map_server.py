@@ -19,6 +19,9 @@ as free if it is below the free threshold, and otherwise as unknown."""
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of map_saver."""
 
+_DECIMALS = 6
+"""Decimals of the origin, metres: micrometres are far below the size of a cell."""
+
 
 def write_map_server_files(path: StrPath, grid: OccupancyGrid) -> None:
     """Write a grid as ``.pgm`` and ``.yaml``.
@@ -41,7 +44,7 @@ def write_map_server_files(path: StrPath, grid: OccupancyGrid) -> None:
         "image": image.name,
         "mode": "trinary",
         "resolution": grid.cell_size,
-        "origin": [*grid.origin, 0.0],
+        "origin": [*(round(value, _DECIMALS) for value in grid.origin), 0.0],
         "negate": 0,
         "occupied_thresh": _OCCUPIED_THRESHOLD,
         "free_thresh": _FREE_THRESHOLD,

@@ -90,7 +90,7 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
     states = torch.where(count >= _MIN_FREE * len(levels), VoxelState.FREE, VoxelState.UNKNOWN).to(torch.int8)
     column, row = ((occupied / size).floor().to(torch.int64) - first).unbind(dim=1)
     states[row * columns + column] = VoxelState.OCCUPIED
-    x, y = (first * size).tolist()
+    x, y = (number * size for number in first.tolist())  # as a tensor the product would be in single precision
     return OccupancyGrid(states.reshape(rows, columns), size, (x, y), T_lw, floor.offset)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import closing
 from pathlib import Path
@@ -30,6 +29,7 @@ from v3d_torch.pipeline.run_record import RunRecord, Snapshot
 from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 from v3d_torch.runtime.process import trim_memory, trim_memory_at_intervals
 from v3d_torch.runtime.stage_timer import StageTime
+from v3d_torch.runtime.stopwatch import Stopwatch
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
@@ -167,6 +167,7 @@ class Pipeline:
         self._with_mask_evaluation = evaluate_masks
         self._skip_broken = skip_broken
         self._snapshot_step = 1
+        self._stopwatch = Stopwatch()
 
     @property
     def frame_count(self) -> int:
@@ -187,7 +188,7 @@ class Pipeline:
         """
         record = self.record
         record.failure, record.interrupted = None, False
-        previous_seconds, start = record.seconds, time.perf_counter()
+        previous_seconds, self._stopwatch = record.seconds, Stopwatch()
         try:
             tracked = self._track_frames() if self._live is None else self._track_live(self._live)
             with torch.inference_mode(), closing(tracked):
@@ -196,7 +197,7 @@ class Pipeline:
                     record.times.append(frame, times)
                     self._record_frame(frame, result)
                     self._viewer.show(frame, result, self.slam, times)
-                    record.seconds, self.between_frames = previous_seconds + time.perf_counter() - start, True
+                    record.seconds, self.between_frames = previous_seconds + self._stopwatch.seconds, True
                     if on_frame is not None:
                         on_frame(frame, result)
         except V3DError as error:
@@ -210,7 +211,7 @@ class Pipeline:
             if isinstance(self.sequence, Sized):
                 done, total = len(self.slam.poses), len(self.sequence)
                 record.failure = f"interrupted after {done} of {total} frames"
-        record.seconds = previous_seconds + time.perf_counter() - start
+        record.seconds = previous_seconds + self._stopwatch.seconds
         return record
 
     @torch.inference_mode()
@@ -307,7 +308,8 @@ class Pipeline:
         self.record.repeated.add(frame.image)
         self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result, self.slam.up)
-        self._evaluate_masks(frame, result)
+        with self._stopwatch.paused():  # no part of the system, whose rate is measured
+            self._evaluate_masks(frame, result)
         for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
             if folder is not None:
                 write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)

@@ -138,8 +138,12 @@ class ObjectTable(TensorTable):
             missed=torch.tensor([each.missed for each in objects]),
         )
 
+    def count_objects(self) -> int:
+        """Return the number of different objects."""
+        return len(self["id"].unique())
+
     def count_motion_states(self) -> dict[MotionState, int]:
-        """Return the number of rows with each motion state, in the order of their first row."""
+        """Return the number of rows, frames times objects, with each motion state, in the order of their first row."""
         return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
 
 
@@ -218,7 +222,7 @@ class RunRecord:
         most_dynamic_snapshot: Frame with the most votes for dynamic objects; of several, that with the most objects.
         mask_evaluation: Comparison of the masks with true masks.
         broken: Broken frames that were skipped.
-        seconds: Wall time of all frames, seconds.
+        seconds: Wall time of all frames without the comparison with true masks, seconds.
         failure: Reason why the run ended before the end of the sequence, or why a file of a whole run could not be
             written; None if there is none.
         diagnosis: Cause of incomplete results of a run that reached the end of the sequence; None if they are complete.

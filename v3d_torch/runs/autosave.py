@@ -99,7 +99,7 @@ class Autosave:
             return
         start, path = time.perf_counter(), self._folder / CHECKPOINT
         write_checkpoint(self._folder, self._pipeline, self._request, self._sizes)
-        seconds, size = time.perf_counter() - start, path.stat().st_size / (1 << 20)
+        seconds, size = time.perf_counter() - start, path.stat().st_size / 1e6
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)
 
     def _report(self, error: OutputError) -> None:

@@ -118,12 +118,13 @@ def calibration_text(calibration: Calibration, name: str) -> str:
 def calibration_table(calibration: Calibration) -> Table:
     """Return a table of all parameters: given value, estimate, standard deviation, and result."""
     table = Table(title="camera")
-    for column in ("parameter", "given", "estimated", "+-", "result"):
-        table.add_column(column, justify="left" if column in ("parameter", "result") else "right", overflow="fold")
+    table.add_column("parameter", no_wrap=True)
+    for column in ("given", "estimated", "+-", "result"):
+        table.add_column(column, justify="left" if column == "result" else "right", overflow="fold")
     for each in calibration.estimates:
         given = "unknown" if each.given is None else f"{each.given:.6g}"
         told = math.isfinite(each.sigma) and math.isfinite(each.value)
-        value, sigma = (f"{each.value:.6g}", f"{each.sigma:.2g}") if told else ("-", "-")
+        value, sigma = _format(each.value, each.sigma) if told else ("-", "-")
         table.add_row(UNITS.get(each.name, "{}").format(each.name), given, value, sigma, _result(each))
     return table
 
@@ -132,11 +133,21 @@ def _result(estimate: Estimate) -> str:
     return "accepted" if estimate.accepted else f"not used: {estimate.reason}"
 
 
+def _format(value: float, sigma: float) -> tuple[str, str]:
+    """Format a value and its standard deviation in fixed point, both rounded to the second digit of the deviation."""
+    if sigma == 0:
+        return f"{value:.6g}", "0"
+    decimals = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))  # rounded first, because 9.99 becomes 10
+    rounded = (round(each, decimals) + 0.0 for each in (value, sigma))  # + 0.0, because -0.0 would have a sign
+    text, sigma_text = (f"{each:.{max(decimals, 0)}f}" for each in rounded)
+    return text, sigma_text
+
+
 def _describe(estimate: Estimate) -> str:
     """Describe an estimate in a few words, for a comment."""
     if not math.isfinite(estimate.sigma) or not math.isfinite(estimate.value):
         return f"not used: {estimate.reason}"
-    value = f"{estimate.value:.6g} +- {estimate.sigma:.2g}"
+    value = " +- ".join(_format(estimate.value, estimate.sigma))
     if not estimate.accepted:
         return f"not used: {estimate.reason} ({value})"
     given = "unknown" if estimate.given is None else f"{estimate.given:.6g}"

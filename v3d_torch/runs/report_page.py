@@ -18,6 +18,7 @@ from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
 from v3d_torch.io.image_file import read_image
 from v3d_torch.runs.stored_run import StoredRun
+from v3d_torch.runs.wall_time import describe_wall_time
 from v3d_torch.viz.figure_output import embed_image, embed_svg
 from v3d_torch.viz.object_timelines import ObjectRow, draw_object_timelines
 from v3d_torch.viz.pose_timelines import draw_errors, draw_masked_fraction, draw_positions, draw_statuses
@@ -80,6 +81,7 @@ def render_page(run: StoredRun) -> str:
             if (run.folder / "figures" / name).is_file()
         ],
         stages=stages,
+        describe_wall_time=describe_wall_time,
         stage_plots=_stage_plots(run, stages),
         changes=changed_values(run.config) if run.config is not None else None,
         config_text=run.config_text,

@@ -43,6 +43,9 @@ if sys.platform != "win32":
 
 _LOG = logging.getLogger(__name__)
 
+_KERNEL_KB = 1024
+"""Bytes in what kernels call a kB; a megabyte of the results has a million bytes."""
+
 _LIBRARIES = ("torch", "kornia", "kornia-rs", "numpy", "onnxruntime", "opencv-python-headless", "pypose", "faiss-cpu")
 
 
@@ -165,9 +168,9 @@ def _peak_memory_mb() -> float | None:
     if (status := Path("/proc/self/status")).is_file():  # on Linux getrusage includes the parent process
         found = re.search(r"^VmHWM:\s*(\d+) kB$", status.read_text(encoding="utf-8"), re.MULTILINE)
         if found is not None:
-            return int(found[1]) / (1 << 10)
+            return int(found[1]) * _KERNEL_KB / 1e6
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    return peak * (1 if sys.platform == "darwin" else _KERNEL_KB) / 1e6
 
 
 def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:

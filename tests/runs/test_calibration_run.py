@@ -1,0 +1,47 @@
+"""Table and file of a calibrated camera."""
+
+from __future__ import annotations
+
+from io import StringIO
+
+import pytest
+from helpers.rooms import CAMERA
+from rich.console import Console
+
+from v3d_torch.calibration.camera_calibration import Calibration
+from v3d_torch.calibration.selection import Estimate
+from v3d_torch.runs.calibration_run import UNITS, calibration_table, calibration_text
+
+
+def calibrated(*estimates: Estimate) -> Calibration:
+    return Calibration(CAMERA, CAMERA, estimates)
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "expected"),
+    [
+        (529.874, 10.2, "530 +- 10"),
+        (4983.0, 99.6, "4980 +- 100"),
+        (4983.0, 104.0, "4980 +- 100"),
+        (123456789.0, 5e6, "123500000 +- 5000000"),
+        (0.26234, 0.0123, "0.262 +- 0.012"),
+        (-0.00004, 0.00101, "0.0000 +- 0.0010"),
+        (1.23456, 0.0, "1.23456 +- 0"),
+    ],
+)
+def test_value_is_rounded_to_the_second_digit_of_its_deviation(value: float, sigma: float, expected: str) -> None:
+    calibration = calibrated(Estimate("fx", 525.0, value, sigma, accepted=True, reason=""))
+    assert f"  # {expected}, given 525\n" in calibration_text(calibration, "desk")
+    console = Console(width=80, file=StringIO(), record=True)
+    console.print(calibration_table(calibration))
+    row = next(line for line in console.export_text().splitlines() if "fx, pixels" in line)
+    assert [cell.strip() for cell in row.split("│")[3:5]] == expected.split(" +- ")
+
+
+def test_names_of_parameters_are_not_broken_at_80_columns() -> None:
+    reason = "not significantly different from the given value"
+    estimates = [Estimate(name, 0.0, -0.012345, 0.0123, accepted=False, reason=reason) for name in UNITS]
+    console = Console(width=80, file=StringIO(), record=True)
+    console.print(calibration_table(calibrated(*estimates)))
+    text = console.export_text()
+    assert all(unit.format(name) in text for name, unit in UNITS.items())
