@@ -31,7 +31,7 @@ from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
-from v3d_torch.runs.result_folder import lock_results, make_result_folder
+from v3d_torch.runs.result_folder import check_unlocked, make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.segmentation import MaskFolder, make_segmenter
@@ -151,9 +151,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     console = Console(soft_wrap=True)
     if request.save_map is not None:
         check_writable(Path(request.save_map))
-    if out is not None and out.is_dir():
-        with lock_results(out):  # an error if another run writes to it, before the inputs and a recording are opened
-            pass
+    if out is not None:
+        check_unlocked(out)  # before the inputs and a recording are opened
     masks = _path(request.masks)
     sequence = _open_sequence(request, console)
     print_notes(sequence, console)

@@ -55,14 +55,16 @@ def make_result_folder(out: Path | None, name: str) -> Path:
             return out
         folder = _make_folder_by_time(runs)
     except OSError as error:
-        raise OutputError(
-            f"{out or runs}: cannot be made ({error.strerror}); choose another folder with --out"
-        ) from error
+        raise _unmakeable_error(out or runs, error) from error
     link = runs / f".latest.{os.getpid()}"  # renamed afterwards, so that ``latest`` always exists
     with suppress(OSError):  # Windows without developer mode and some file systems have no links
         link.symlink_to(folder.name)
         link.replace(runs / "latest")
     return folder
+
+
+def _unmakeable_error(folder: Path, error: OSError) -> OutputError:
+    return OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out")
 
 
 def _make_folder_by_time(runs: Path) -> Path:
@@ -78,6 +80,21 @@ def _make_folder_by_time(runs: Path) -> Path:
             folder = runs / f"{now}_{number}"
         else:
             return folder
+
+
+def check_unlocked(folder: Path) -> None:
+    """Check that no run or batch is writing to a folder, which can be missing.
+
+    Raises:
+        OutputError: If another run or batch is writing to the folder, or if it cannot be made or written.
+    """
+    try:
+        is_folder = folder.is_dir()
+    except OSError as error:  # such as a name that is too long
+        raise _unmakeable_error(folder, error) from error
+    if is_folder:
+        with lock_results(folder):
+            pass
 
 
 @contextmanager

@@ -191,7 +191,7 @@ CASES = [
         all_of(SAVE, SERIAL),
         Fails(
             "{out}/masks/...: cannot be written (Not a directory); free the disk or choose another folder;"
-            " {out}/trajectory.txt: cannot be written (File exists); free the disk or choose another folder"
+            " {out}/request.yaml: cannot be written (File exists); free the disk or choose another folder"
         ),
         lambda place: at_frame(4, lambda: (shutil.rmtree(place.out), place.out.write_text(""))),
     ),
