@@ -348,7 +348,7 @@ class V3DSLAM(FramePreprocessor):
         self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
     ) -> Keyframe | None:
         """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
-        part, reference = self.poses.part, self.track_camera.reference_keyframe(pose)
+        part, reference = self.poses.part, self.track_camera.reference_keyframe(pose, self.poses)
         predicted_T_cw = self._compose_pose(motion)  # with the corrections of the world since the objects were measured
         keyframe = self.mapper(frame, features, pose, reference)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)

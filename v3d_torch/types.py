@@ -205,6 +205,11 @@ class TrackingStatus(StrEnum):
     LOST = "lost"
     """Not found: predicted, and interpolated after the camera is found again."""
 
+    @property
+    def is_located(self) -> bool:
+        """True if the pose is known relative to the whole map."""
+        return self in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
+
 
 @dataclass(frozen=True)
 class FramePose:

@@ -7,10 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.moving_camera import EYE, Camera, frame_pose
+from helpers.moving_camera import EYE, TWIST, Camera, frame_pose
 from helpers.sparse_maps import features, make_map
 from torch import Tensor
 
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracking
@@ -47,3 +48,32 @@ def test_camera_is_relocalised_if_its_pose_does_not_continue_one_in_the_map(prev
     assert found.status is TRACKED and found.is_relocalised
     missed = track(previous, in_local_map=False, at_known_place=False)
     assert missed.status is (LOST if previous is LOST else ODOMETRY) and not missed.is_relocalised
+
+
+def test_frame_without_landmarks_does_not_move_with_another_part_of_the_map() -> None:
+    """A camera that started part 1 is found again in part 0; then tracking fails, and a loop moves part 1."""
+    sparse_map, unmatched = make_map(), torch.full((20,), -1)
+    first = sparse_map.insert_keyframe(0, 0.0, EYE, features(20), unmatched)
+    second = sparse_map.insert_keyframe(1, 0.1, EYE, features(20, seed=1), unmatched)
+    second.part = sparse_map.unused_part
+    camera, track_nothing = Camera(), SimpleNamespace(relocalise=lambda *args: None)
+    tracker = CameraTracker(lambda *args: None, track_nothing, sparse_map, 5)
+    camera.append(0.0, frame_pose(EYE, LOST), None, new=first)
+    camera.append(0.1, frame_pose(EYE, LOST), first, new=second)
+    found = FramePose(TRACKED, EYE, first.landmarks)
+    camera.append(0.2, found, tracker.reference_keyframe(found, camera.poses), EYE)
+    motion = CameraMotion(EYE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), True)
+    missed = tracker(features(20), torch.zeros(1, 480, 640), EYE, unmatched, motion, camera.poses)
+    assert missed.status is ODOMETRY
+    camera.append(0.3, missed, tracker.reference_keyframe(missed, camera.poses), EYE)
+    sparse_map.move_keyframes(torch.stack([EYE, se3_exp(TWIST)]))
+    assert camera.poses.is_located and torch.equal(camera.poses.T_cw, EYE)
+
+
+def test_reference_keyframe_of_a_first_frame_without_landmarks_is_the_last_keyframe() -> None:
+    sparse_map, unmatched, poses = make_map(), torch.full((20,), -1), Camera().poses
+    tracker = CameraTracker(lambda *args: None, SimpleNamespace(relocalise=lambda *args: None), sparse_map, 5)
+    assert tracker.reference_keyframe(frame_pose(EYE, LOST), poses) is None
+    for index in range(2):
+        sparse_map.insert_keyframe(index, 0.1 * index, EYE, features(20, seed=index), unmatched)
+    assert tracker.reference_keyframe(frame_pose(EYE, LOST), poses) is sparse_map.keyframes[-1]

@@ -18,7 +18,6 @@ from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 from v3d_torch.occupancy.view_store import ViewStore, displacement
 from v3d_torch.tracking.pose_history import PoseHistory
-from v3d_torch.types import TrackingStatus
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,7 +82,7 @@ class OccupancyMapper:
         """
         self.up = up or self.up
         frame = len(poses) - 1
-        if frame % self._config.interval != 0 or not _is_reliable(poses):
+        if frame % self._config.interval != 0 or not poses.is_located:
             return
         view = RangeView.sample(self._count, depth[0], static, self._config.stride)
         self._store.append(view, frame, poses.T_cw)
@@ -179,9 +178,3 @@ class OccupancyMapper:
         view = self._store.views[position]
         rays = view.rays(self._camera, self._config.stride)
         occupancy.integrate(view.depth, view.static, rays, invert(self._store.T_cw[position]))
-
-
-def _is_reliable(poses: PoseHistory) -> bool:
-    """Check whether the pose of the last frame is known relative to the whole map."""
-    is_found = poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
-    return is_found and not (poses.keyframe is not None and poses.keyframe.disconnected)

@@ -19,12 +19,9 @@ from v3d_torch.io.download import Progress
 from v3d_torch.io.image_file import read_image
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.stored_run import StoredRun
-from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
+from v3d_torch.types import RGBDFrame, Trajectory
 
 _MASKS = "map_masks"
-
-_LOCATED = (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
-"""Statuses of frames whose pose is known relative to the whole map."""
 
 _STAMP_TOLERANCE = 2e-6
 """Tolerance of timestamps, seconds: files have six decimals."""
@@ -90,7 +87,7 @@ def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFr
     """
     table = [] if run.frames is None else run.frames.select(["frame", "keyframe"]).to_pylist()
     # Broken frames have no row and no pose.
-    rows = [position for position, status in enumerate(run.metrics.status[: len(table)]) if status in _LOCATED]
+    rows = [position for position, status in enumerate(run.metrics.status[: len(table)]) if status.is_located]
     if not rows or run.trajectory is None:
         raise InputError(f"{run.folder}: has no frame with a known pose; run another sequence")
     if only_keyframes:

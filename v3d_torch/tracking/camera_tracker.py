@@ -79,15 +79,23 @@ class CameraTracker:
                 return FramePose(
                     TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks, tracking.information, is_relocalised
                 )
-        known = motion.is_measured and poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
+        known = motion.is_measured and poses.is_located
         status = TrackingStatus.ODOMETRY if known else TrackingStatus.LOST
         return FramePose(status, T_cw, torch.full((len(features),), -1, dtype=torch.int64))
 
-    def reference_keyframe(self, pose: FramePose) -> Keyframe | None:
+    def reference_keyframe(self, pose: FramePose, poses: PoseHistory) -> Keyframe | None:
         """Return the keyframe that shares most landmarks with a frame; None if there is no keyframe.
 
-        If the frame has no landmarks, this is the last keyframe.
+        A frame without landmarks continues the motion of the previous frame, so that it has the reference keyframe of
+        that frame: the last keyframe can belong to another part of the map. Without a previous frame in the map it is
+        the last keyframe.
+
+        Args:
+            pose: Pose of the frame.
+            poses: Poses of all earlier frames.
         """
         keyframes = self._map.keyframes
         best = self._map.covisible_keyframes(pose.observed_landmarks, 1)
-        return keyframes[int(best[0])] if len(best) else (keyframes[-1] if keyframes else None)
+        if len(best):
+            return keyframes[int(best[0])]
+        return poses.keyframe or (keyframes[-1] if keyframes else None)

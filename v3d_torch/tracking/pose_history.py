@@ -71,6 +71,12 @@ class PoseHistory:
         return self._keyframe_of(-1) if len(self) else None
 
     @property
+    def is_located(self) -> bool:
+        """True if the pose of the last frame is known relative to the whole map; False before the first."""
+        status, keyframe = self.status, self.keyframe
+        return status is not None and status.is_located and not (keyframe is not None and keyframe.disconnected)
+
+    @property
     def part(self) -> int:
         """ID of the part of the map in which the camera was last found, see `Keyframe`; 0 if it was not found."""
         return 0 if self._place is None else self._place.part
