@@ -17,8 +17,8 @@ from v3d_torch.optim.levenberg_marquardt import student_t, student_t_scale
 State = tuple[Tensor, Tensor]  # T_ba (4, 4); gain and bias from the reference's brightness to the current one's (2,)
 System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba @ exp(xi), gain, bias
 
-_DAMPING_FACTOR = 1e3
-"""Damping added to that of Levenberg-Marquardt. The Jacobian of the reference only approximates that of the current
+_DAMPING_SCALE = 1e3
+"""Factor of the damping of Levenberg-Marquardt. The Jacobian of the reference only approximates that of the current
 view; with less damping, the step after a rejected step is rejected, too."""
 
 _REGULARISATION = 1e-9
@@ -150,6 +150,6 @@ class AlignmentProblem:
 def step(state: State, system: System, damping: Tensor) -> State:
     """State after a damped Gauss-Newton step."""
     H, gradient = system
-    diagonal = _DAMPING_FACTOR * damping * H.diagonal() + _REGULARISATION
+    diagonal = _DAMPING_SCALE * damping * H.diagonal() + _REGULARISATION
     change = -torch.linalg.solve(H + diagonal.diag(), gradient)
     return state[0] @ se3_exp(change[:6]), state[1] + change[6:]
