@@ -86,7 +86,7 @@ class Level:
         channels: Brightness and inverse depth (1/m), float32, shape :math:`(2, H, W)`. NaN for pixels that are not
             static or not measured, so that every interpolation that uses them is NaN, too.
         level_camera: Camera model of this level.
-        config: Number of reference points, threshold of depth edges.
+        config: Threshold of depth edges.
     """
 
     channels: Tensor
@@ -133,7 +133,7 @@ class DenseView:
         depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
         static: Mask of the static pixels, bool, shape :math:`(H, W)`.
         cameras: Camera model of each pyramid level, by its number of halvings.
-        config: Maximum depth, threshold of depth edges, number of reference points.
+        config: Maximum depth, threshold of depth edges.
     """
 
     def __init__(
