@@ -80,8 +80,9 @@ class MaskEvaluation:
     5 m. No detector finds smaller parts, such as a sleeve behind a door."""
 
     MAX_ABSENCE = 0.5
-    """Maximum time out of view after which the id must be the same, seconds. Without appearance features, the identity
-    of a person who returns later cannot be known."""
+    """Maximum time out of view after which the id must be the same, seconds. The score measures
+    whether ids continue, not whether people are recognised: after a longer absence, the last position of a person does
+    not show who returns."""
 
     def __init__(self) -> None:
         self._frames = 0
