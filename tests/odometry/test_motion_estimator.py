@@ -38,12 +38,12 @@ def test_motion_is_deterministic() -> None:
 
 
 def test_speed_is_bounded_also_between_frames_that_were_received_at_once() -> None:
-    twist = torch.tensor([0.03, 0, 0, 0, 0.02, 0], dtype=torch.float64)
-    motion = RelativeMotion(se3_exp(twist), torch.zeros(0, 2, dtype=torch.int64))
+    xi = torch.tensor([0.03, 0, 0, 0, 0.02, 0], dtype=torch.float64)
+    motion = RelativeMotion(se3_exp(xi), torch.zeros(0, 2, dtype=torch.int64))
     assert motion.is_plausible(1 / 30, 5.0) and motion.is_plausible(0.002, 5.0)
     assert not motion.is_plausible(0.002, 2.0)
-    torch.testing.assert_close(motion.velocity(1 / 30), 30 * twist)
-    torch.testing.assert_close(motion.velocity(0.002), twist / MIN_INTERVAL)
+    torch.testing.assert_close(motion.velocity(1 / 30), 30 * xi)
+    torch.testing.assert_close(motion.velocity(0.002), xi / MIN_INTERVAL)
 
 
 def test_no_motion_without_depth_or_matches() -> None:

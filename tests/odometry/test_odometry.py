@@ -78,9 +78,7 @@ def test_features_are_tried_first(demo: RGBDSequence) -> None:
 
 
 @pytest.mark.parametrize("overrides", [(), (NO_FEATURES,)], ids=["features", "dense"])
-def test_velocity_of_a_measured_motion_is_its_mean_twist_per_second(
-    demo: RGBDSequence, overrides: tuple[str, ...]
-) -> None:
+def test_velocity_of_a_measured_motion_is_its_mean_twist(demo: RGBDSequence, overrides: tuple[str, ...]) -> None:
     frames = two_frames(demo, 0, 3, *overrides)
     motion = frames.estimate()
     assert motion.is_measured

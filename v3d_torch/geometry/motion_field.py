@@ -27,7 +27,7 @@ def motion_field(uv: Tensor, inverse_depth: Tensor, velocity: Tensor, K: Tensor)
         uv: Undistorted pixels, float64, shape :math:`(..., N, 2)`.
         inverse_depth: Inverse depth of each pixel, 1/m, float64, shape :math:`(..., N)`; 0 = infinitely far, so that
             only the rotation moves the pixel.
-        velocity: Twist per second ``[m/s, rad/s]`` by which the points move in the camera frame, float64, shape
+        velocity: Twist ``[m/s, rad/s]`` by which the points move in the camera frame, float64, shape
             :math:`(..., 6)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
         K: Camera matrix, float64, shape :math:`(..., 3, 3)`.
 

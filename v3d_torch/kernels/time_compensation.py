@@ -35,7 +35,7 @@ def compensate_depth_delay(
         pixel: (column, row) in the recorded image, (N, 2).
         inverse_depth: Inverse depth before the compensation, 1/m, (N,); 0 = no measurement.
         depth_image: Depth image, metres, (H, W); 0 = no measurement.
-        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
+        velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
         delay: Depth stamp minus colour stamp, seconds.
         max_depth: Depth above this counts as missing, metres.
         intrinsics: ``fx, fy, cx, cy``.
@@ -64,7 +64,7 @@ def compensate_rolling_shutter(
         uv: Undistorted pixels, compensated with ``readout_jacobian``, (N, 2).
         row: Row in the recorded image, (N,).
         inverse_depth: Inverse depth, 1/m, (N,); 0 = no measurement.
-        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
+        velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
         K: Camera matrix, (3, 3).
         readout_jacobian: Readout Jacobian with which ``uv`` was compensated, pixels per second, (N, 2); it is replaced.
         readout: Time from the first to the last row, seconds.

@@ -66,7 +66,7 @@ class DepthDelayCompensation:
         Args:
             features: Features of the colour image.
             depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+            velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
             delay: Depth stamp minus colour stamp, seconds.
 

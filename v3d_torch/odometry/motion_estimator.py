@@ -42,20 +42,20 @@ class RelativeMotion:
     pairs: Tensor
 
     @cached_property
-    def twist(self) -> Tensor:
+    def xi(self) -> Tensor:
         """Logarithm of ``T_ba``, ``[translation, rotation]``, metres and radians, float64, shape :math:`(6,)`."""
         return se3_log(self.T_ba)
 
     def velocity(self, elapsed: float) -> Tensor:
-        """Mean twist per second.
+        """Mean twist of static points in the camera frame.
 
         Args:
             elapsed: Time between the views, seconds; at least `MIN_INTERVAL` is assumed.
 
         Returns:
-            Metres and radians per second, float64, shape :math:`(6,)`.
+            Twist ``[m/s, rad/s]``, float64, shape :math:`(6,)`.
         """
-        return self.twist / max(elapsed, MIN_INTERVAL)
+        return self.xi / max(elapsed, MIN_INTERVAL)
 
     def is_plausible(self, elapsed: float, max_speed: float) -> bool:
         """Check whether a handheld camera or a camera on a robot can move this fast.
@@ -65,7 +65,7 @@ class RelativeMotion:
             max_speed: Maximum speed of a camera, m/s.
         """
         elapsed = max(elapsed, MIN_INTERVAL)
-        distance, angle = float(self.twist[:3].norm()), float(self.twist[3:].norm())
+        distance, angle = float(self.xi[:3].norm()), float(self.xi[3:].norm())
         return distance <= max_speed * elapsed and angle <= _MAX_ROTATION_RATE * elapsed
 
     def propagate_landmarks(self, landmarks: Tensor, count: int) -> Tensor:

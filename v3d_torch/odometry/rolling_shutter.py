@@ -149,7 +149,7 @@ def compensate_rolling_shutter(
         row: Row of each pixel in the recorded image, shape :math:`(*, N)`.
         inverse_depth: Inverse depth of each pixel, 1/m, shape :math:`(*, N)`; 0 = not measured. A pixel without depth
             is treated as infinitely far.
-        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, shape
+        velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, shape
             :math:`(*, 6)`: ``T_cw`` becomes ``exp(velocity * dt) @ T_cw``.
         readout: Time from the first to the last row, seconds, a number or shape :math:`(*)`; negative if the rows are
             read from the bottom up.
@@ -183,7 +183,7 @@ def compensate_features(features: Features, velocity: Tensor, readout: Readout, 
 
     Args:
         features: Features as observed, or compensated with the same readout and another velocity.
-        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+        velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
             :math:`(6,)`.
         readout: Readout of the camera.
         camera: Camera that observed the features.

@@ -34,7 +34,7 @@ class TimeCompensation:
             depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds; the
                 camera's own delay is added.
-            velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+            velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
             readout: Readout of the camera.
         """

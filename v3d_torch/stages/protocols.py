@@ -56,7 +56,7 @@ class CompensationStage(Protocol):
             features: Features as observed.
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
             depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
-            velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+            velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
             readout: Readout of the camera.
 

@@ -26,7 +26,7 @@ class PosePrediction:
     Attributes:
         stamp: Time of the frame, seconds.
         T_cw: World-to-camera pose of the frame, float64, shape :math:`(4, 4)`.
-        velocity: Twist per second ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
+        velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
             :math:`(6,)`.
     """
 
@@ -47,7 +47,7 @@ class MotionModel:
     """Estimates the velocity of the camera from the poses of its frames.
 
     Attributes:
-        velocity: Twist per second after the last frame, as in `PosePrediction`.
+        velocity: Twist of static points in the camera frame after the last frame, as in `PosePrediction`.
     """
 
     def __init__(self) -> None:
