@@ -294,7 +294,7 @@ class InstanceTracker(torch.nn.Module):
         lost = [*lost, *(track for track in resting if stamp - track.newest.stamp > longest)]
         for track in lost:
             track.drop_masks()
-            track.drop_history()
+            track.drop_old_detections()
         remembered = longest + self._config.max_lost_time
         candidates = [*self.lost, *(track for track in lost if track.is_confirmed)]
         self.lost = [track for track in candidates if stamp - track.newest.stamp <= remembered]

@@ -41,7 +41,7 @@ _CONFIRMING_DYNAMIC_FRAMES = 2
 _APPEARANCE_RATE = 0.1
 """Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
 
-_HISTORY = 1.0
+_DETECTION_TIME = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest time span of the vote."""
 
 _STATE_HISTORY, _HISTORY_INTERVAL = 10.0, 0.1 - 1e-3
@@ -90,7 +90,7 @@ class Track:
     Attributes:
         id: Number of the object, from 1, never reused.
         first_stamp: Timestamp of the first detection since the object was last lost, or not observed for longer than
-            the history, seconds.
+            detections are kept, seconds.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
@@ -219,12 +219,12 @@ class Track:
         return _WHOLE_SIGMA + _PARTIAL_SIGMA * (1 - fewer / more)
 
     def add_detection(self, detection: Detection3D) -> None:
-        """Add a detection, update the Kalman filter, and drop detections older than the history.
+        """Add a detection, update the Kalman filter, and drop detections that are too old.
 
         Args:
             detection: Detection, not older than the newest one.
         """
-        oldest = detection.stamp - _HISTORY - STAMP_TOLERANCE
+        oldest = detection.stamp - _DETECTION_TIME - STAMP_TOLERANCE
         if self.detections and self.newest.stamp < oldest:  # the next detections have no earlier one to compare with
             self.first_stamp = detection.stamp
         self._max_points = max(self._max_points, len(detection.cloud))
@@ -252,7 +252,7 @@ class Track:
         self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True)
         self.visible = False
 
-    def drop_history(self) -> None:
+    def drop_old_detections(self) -> None:
         """Drop all but the newest detection: motion is not measured across a long absence."""
         self.detections = self.detections[-1:]
 
