@@ -41,7 +41,7 @@ def test_damped_step_equals_the_dense_solution() -> None:
     given = scene.observations | {"fixed": fixed} | optional
     problem, state, _ = prepare_bundle(scene.start, scene.start_points, **given)
     _, at_start = problem.residuals_at(state)
-    xi, shift = solve_normal_equations(problem.linearise(at_start, points=12), damping)
+    xi, shift = solve_normal_equations(problem.linearise(at_start, point_count=12), damping)
     torch.testing.assert_close(torch.cat([xi.T.flatten(), shift.T.flatten()]), expected, rtol=1e-7, atol=1e-9)
 
 

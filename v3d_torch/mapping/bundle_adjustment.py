@@ -163,14 +163,14 @@ def sort_by_point(
     pose: Tensor,
     point: Tensor,
     fixed: Tensor,
-    points: int,
+    point_count: int,
 ) -> Iterator[tuple[NDArray[np.int64], SortedProblem]]:
     """Sort the observations of each problem of a batch by point; yield their order and the arguments of the kernels."""
     batch = fixed.shape[:-1]
     columns = scale, offset, thresholds, weights, pose, point, fixed
     for row in zip(*(to_rows(each, batch) for each in columns), strict=True):
         order = np.argsort(row[5], kind="stable")
-        of_points = np.searchsorted(row[5][order], np.arange(points + 1))
+        of_points = np.searchsorted(row[5][order], np.arange(point_count + 1))
         # The last dimension is that of the observations.
         yield order, (*(each.take(order, axis=-1) for each in row[:5]), of_points, np.flatnonzero(~row[6]))
 

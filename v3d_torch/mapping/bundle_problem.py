@@ -84,14 +84,14 @@ class BundleProblem(NamedTuple):
         """Squared whitened residual of each observation, shape :math:`(..., M)`; infinite behind the camera."""
         return chi_square(residuals.in_camera.mT, residuals.whitened.mT)
 
-    def linearise(self, residuals: BundleResiduals, points: int) -> NormalEquations:
-        """Normal equations of the robust cost of ``points`` points, linearised at the given residuals."""
+    def linearise(self, residuals: BundleResiduals, point_count: int) -> NormalEquations:
+        """Normal equations of the robust cost of ``point_count`` points, linearised at the given residuals."""
         J = self._jacobian(residuals)
         weighted = J * residuals.weights[..., None, None, :]
         blocks = (weighted[..., :, None, :, :] * J[..., None, :, :, :]).sum(dim=-2)
-        return self._assemble(blocks, (weighted * residuals.whitened[..., None, :, :]).sum(dim=-2), points)
+        return self._assemble(blocks, (weighted * residuals.whitened[..., None, :, :]).sum(dim=-2), point_count)
 
-    def remaining(self, residuals: BundleResiduals, derivative: Tensor, points: int) -> Tensor:
+    def remaining(self, residuals: BundleResiduals, derivative: Tensor, point_count: int) -> Tensor:
         r"""Part of a change of the residuals that no change of poses and points explains.
 
         With the Jacobian :math:`J` by poses and points, the remaining part of a change :math:`j` of the residuals is
@@ -102,12 +102,12 @@ class BundleProblem(NamedTuple):
             residuals: Residuals at the poses and points of the linearisation.
             derivative: First-order changes of the whitened residuals, shape :math:`(*, ..., 3, M)`; a problem can have
                 several changes.
-            points: Number of points.
+            point_count: Number of points.
 
         Returns:
             Shape :math:`(*, ..., 3, M)`.
         """
-        change = self.linearise(residuals._replace(whitened=derivative), points)
+        change = self.linearise(residuals._replace(whitened=derivative), point_count)
         xi, delta = solve_normal_equations(change, NEGLIGIBLE_DAMPING)
         none = xi.new_zeros(*xi.shape[:-1], 1)
         of_pose = gather_columns(torch.cat([xi, none], dim=-1), change.pose)
@@ -169,16 +169,16 @@ class BundleProblem(NamedTuple):
         weighted = residuals.whitened * residuals.weights[..., None, :]
         return (self._jacobian(residuals) * weighted[..., None, :, :]).sum(dim=-2)
 
-    def _assemble(self, blocks: Tensor, gradient: Tensor, points: int) -> NormalEquations:
+    def _assemble(self, blocks: Tensor, gradient: Tensor, point_count: int) -> NormalEquations:
         """Normal equations of the blocks (..., 9, 9, M) and gradients (*, ..., 9, M) of all observations."""
         rows, free = self._rows
         row = rows.gather(-1, self.pose)
         return NormalEquations(
             U=sum_columns(blocks[..., :6, :6, :].flatten(-3, -2), row, free).unflatten(-2, (6, 6)),
-            V=sum_columns(blocks[..., 6:, 6:, :].flatten(-3, -2), self.point, points).unflatten(-2, (3, 3)),
+            V=sum_columns(blocks[..., 6:, 6:, :].flatten(-3, -2), self.point, point_count).unflatten(-2, (3, 3)),
             W=blocks[..., 6:, :6, :],
             pose_gradient=sum_columns(gradient[..., :6, :], row, free),
-            point_gradient=sum_columns(gradient[..., 6:, :], self.point, points),
+            point_gradient=sum_columns(gradient[..., 6:, :], self.point, point_count),
             pose=row,
             point=self.point,
         )
