@@ -251,7 +251,7 @@ def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> N
     [
         (Readout(0.0, math.inf), "0.0000 s, as the camera states"),
         (Readout(0.024, 1e6), "0.0240 s, standard deviation 0.0010 s"),
-        (Readout(0.008, 1e4), "0.0080 s is assumed; the images tell it only to 0.0100 s"),
+        (Readout(0.008, 1e4), "0.0080 s; the images determine it only with a standard deviation of 0.0100 s"),
     ],
 )
 def test_log_says_whether_the_images_tell_the_readout(readout: Readout, text: str) -> None:

@@ -30,8 +30,8 @@ MAX_P_VALUE = 1e-3
 """Significance level: maximum probability of a difference by chance with which an estimate is accepted."""
 
 _FOCAL_ERROR = 0.015
-"""Relative standard deviation of focal lengths by what the model lacks: true lens distortion differs from its model,
-the readout is not constant, depth has errors. It is that of recordings whose focal lengths are known."""
+"""Relative standard deviation of focal lengths due to errors of the camera model: true lens distortion differs from its
+model, the readout is not constant, depth has errors. It is that of recordings whose focal lengths are known."""
 
 _CENTRE_ERROR = 0.005
 """Standard deviation of the principal point by the same causes, relative to the width of the image. It is that
@@ -106,13 +106,13 @@ class _Fit:
         return math.sqrt(max(float(self.covariance[index, index]), 0.0))
 
     def model_error(self, name: str) -> float:
-        """Standard deviation of a parameter by what the model lacks."""
+        """Standard deviation of a parameter due to errors of the camera model."""
         if name in ("fx", "fy"):
             return _FOCAL_ERROR * self.values[name]
         return _CENTRE_ERROR * self.width if name in ("cx", "cy") else 0.0
 
     def total_sigma(self, name: str) -> float:
-        """Standard deviation of a parameter by noise and by what the model lacks."""
+        """Standard deviation of a parameter due to noise and to errors of the camera model."""
         return math.hypot(self.sigma(name), self.model_error(name))
 
     def covariance_of(self, group: ParameterGroup) -> Tensor:

@@ -15,7 +15,7 @@ from torch import Tensor
 _NEW_OBJECT_VOLUME = 10.0
 """Inverse density of new objects, cubic metres: about the volume that the camera observes."""
 
-_TAIL = 4.0
+_DEGREES_OF_FREEDOM = 4.0
 """Degrees of freedom of Student's t-distribution of the innovations: some people turn or stop at once, and some masks
 cover half of a person, so that large errors are more frequent than in a normal distribution."""
 
@@ -74,9 +74,13 @@ def position_log_ratio(squared_distance: Tensor, variance: Tensor) -> Tensor:
     Returns:
         Log-likelihood ratio, shape :math:`(*)`; 0 if a position is unknown.
     """
-    exponent, variance = (_TAIL + 3) / 2, variance.clamp(max=_MAX_VARIANCE)
-    constant = math.lgamma(exponent) - math.lgamma(_TAIL / 2) - 1.5 * math.log(_TAIL * math.pi)
-    log_density = constant - 1.5 * variance.log() - exponent * (squared_distance / (variance * _TAIL)).log1p()
+    exponent, variance = (_DEGREES_OF_FREEDOM + 3) / 2, variance.clamp(max=_MAX_VARIANCE)
+    constant = (
+        math.lgamma(exponent) - math.lgamma(_DEGREES_OF_FREEDOM / 2) - 1.5 * math.log(_DEGREES_OF_FREEDOM * math.pi)
+    )
+    log_density = (
+        constant - 1.5 * variance.log() - exponent * (squared_distance / (variance * _DEGREES_OF_FREEDOM)).log1p()
+    )
     return (math.log(_NEW_OBJECT_VOLUME) + log_density).nan_to_num(nan=0.0)
 
 

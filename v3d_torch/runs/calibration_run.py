@@ -111,7 +111,10 @@ def calibration_text(calibration: Calibration, name: str) -> str:
         comments.setdefault(field, []).append(
             f"{each.name} {_describe(each)}" if field != each.name else _describe(each)
         )
-    heading = f"# Calibrated by v3d-torch calibrate from {name}. Values are accepted if determined by it.\n"
+    heading = (
+        f"# Calibrated by v3d-torch calibrate from {name}. A value is replaced only if the recording determines it; the"
+        " comment states why the others were kept.\n"
+    )
     return heading + camera_text(calibration.camera, {field: "; ".join(texts) for field, texts in comments.items()})
 
 
@@ -123,8 +126,8 @@ def calibration_table(calibration: Calibration) -> Table:
         table.add_column(column, justify="left" if column == "result" else "right", overflow="fold")
     for each in calibration.estimates:
         given = "unknown" if each.given is None else f"{each.given:.6g}"
-        told = math.isfinite(each.sigma) and math.isfinite(each.value)
-        value, sigma = _format(each.value, each.sigma) if told else ("-", "-")
+        is_known = math.isfinite(each.sigma) and math.isfinite(each.value)
+        value, sigma = _format(each.value, each.sigma) if is_known else ("-", "-")
         table.add_row(UNITS.get(each.name, "{}").format(each.name), given, value, sigma, _result(each))
     return table
 

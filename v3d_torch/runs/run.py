@@ -181,13 +181,14 @@ class Run:
 
 
 def describe_readout(readout: Readout, expected: RollingShutterConfig) -> str:
-    """Return the readout in words, and whether the images tell it."""
+    """Return the readout in words, and whether the images determine it."""
     if not expected.enabled:
         return "not compensated"
     if readout.is_certain:
         return f"{readout.seconds:.4f} s, as the camera states"
     if readout.sigma > expected.readout_sigma / 2:
-        return f"{readout.seconds:.4f} s is assumed; the images tell it only to {readout.sigma:.4f} s"
+        uncertainty = f"the images determine it only with a standard deviation of {readout.sigma:.4f} s"
+        return f"{readout.seconds:.4f} s; {uncertainty}"
     return f"{readout.seconds:.4f} s, standard deviation {readout.sigma:.4f} s"
 
 

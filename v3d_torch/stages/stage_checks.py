@@ -100,7 +100,7 @@ _INNER_STAGES = {
     "track_map": "track_camera",
     "loop_closer": "track_camera and back_end",
 }
-"""Stages that are used inside others, which keep their own references, and these others."""
+"""Stages to which other stages hold a reference, and the names of these stages."""
 
 STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end")))
 """Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
