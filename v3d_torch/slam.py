@@ -17,6 +17,7 @@ from v3d_torch.frame_result import FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.mapping.landmark_ids import compact_landmarks
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
@@ -261,8 +262,9 @@ class V3DSLAM(FramePreprocessor):
         with self.timer("mapping"):
             self._apply_world_correction(self.back_end.apply(result))
             previous = None if self._previous is None else self._previous.landmarks
-            self.map.compact(
-                [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous]
+            compact_landmarks(
+                self.map,
+                [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous],
             )
 
     def advance_predictions(self) -> PosePrediction | None:

@@ -17,6 +17,8 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.mapping.covisibility import count_shared_landmarks
+from v3d_torch.mapping.culling import cull_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
@@ -182,7 +184,7 @@ def test_loop_correction_fuses_the_landmarks_of_both_laps(closed: Camera, drifte
 
     def shared(camera: Camera) -> int:
         landmarks = camera.map.keyframes[first + 1].landmarks
-        return int(camera.map.count_shared_landmarks(landmarks[landmarks >= 0])[: LAP // 2].sum())
+        return int(count_shared_landmarks(camera.map, landmarks[landmarks >= 0])[: LAP // 2].sum())
 
     assert shared(drifted) == 0
     assert shared(closed) > 100
@@ -209,7 +211,7 @@ def test_loop_correction_is_as_accurate_after_both_ends_of_an_earlier_loop_were_
         if k == 40:
             (_, end), (begin, _) = ((loop.i, loop.j) for loop in camera.map.loops)
             references = {begin: begin + 1, end: end + 2, 15: 14}
-            camera.map.cull_keyframes(references)
+            cull_keyframes(camera.map, references)
             camera.loop_closer.remove_keyframes(references)
     assert camera.loop_closer.loop_count == closed.loop_closer.loop_count == 3
     assert camera.errors().max() < 1.2 * closed.errors().max()

@@ -15,7 +15,8 @@ from torch import Tensor
 from v3d_torch.config import Config, MappingConfig
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.mapping.culling import cull_redundant_keyframes
+from v3d_torch.mapping.covisibility import count_shared_landmarks, covisibility_edges
+from v3d_torch.mapping.culling import cull_keyframes, cull_landmarks, cull_redundant_keyframes
 from v3d_torch.mapping.sparse_map import SparseMap
 
 LANDMARKS = 20
@@ -108,9 +109,9 @@ def test_culling_a_keyframe_removes_its_observations_and_its_own_landmarks_only(
     insert(sparse_map, dict.fromkeys(range(1, LANDMARKS), 0), new=1)
     for _ in range(3):
         insert(sparse_map, dict.fromkeys(range(LANDMARKS), 0))
-    before = sparse_map.count_shared_landmarks(torch.arange(LANDMARKS + 1))
-    sparse_map.cull_keyframes({1: 2})
-    culled, after = sparse_map.keyframes[1], sparse_map.count_shared_landmarks(torch.arange(LANDMARKS + 1))
+    before = count_shared_landmarks(sparse_map, torch.arange(LANDMARKS + 1))
+    cull_keyframes(sparse_map, {1: 2})
+    culled, after = sparse_map.keyframes[1], count_shared_landmarks(sparse_map, torch.arange(LANDMARKS + 1))
     assert len(culled.features) == len(culled.landmarks) == after[1] == 0
     assert torch.equal(after[[0, 2, 3, 4]], before[[0, 2, 3, 4]])
     assert torch.nonzero(~sparse_map.landmarks["active"]).tolist() == [[LANDMARKS]]
@@ -127,7 +128,7 @@ def test_culled_keyframes_and_their_landmarks_move_with_the_reference_keyframe()
     sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(4)], moving=True)
     sparse_map.landmarks["keyframe"][:5] = 1
     for references in ({1: 2}, {2: 4}):
-        sparse_map.cull_keyframes(references)
+        cull_keyframes(sparse_map, references)
         before, points = sparse_map.T_cw, sparse_map.landmarks["point"].clone()
         moved = torch.stack([pose(100 + index) for index in range(5)])
         sparse_map.move_keyframes(moved)
@@ -152,8 +153,8 @@ def test_reference_of_a_culled_keyframe_is_active_if_both_are_culled_at_once() -
 
 def test_consecutive_active_keyframes_are_connected_across_culled_ones() -> None:
     sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(5)])
-    sparse_map.cull_keyframes({1: 0, 2: 0, 4: 5})
-    assert sparse_map.covisibility_edges(LANDMARKS + 1).tolist() == [list(pair) for pair in pairwise([0, 3, 5])]
+    cull_keyframes(sparse_map, {1: 0, 2: 0, 4: 5})
+    assert covisibility_edges(sparse_map, LANDMARKS + 1).tolist() == [list(pair) for pair in pairwise([0, 3, 5])]
 
 
 # --- landmarks
@@ -165,10 +166,10 @@ def test_landmarks_with_a_low_found_ratio_are_culled_after_the_next_keyframe() -
     for turn in range(8):  # landmark 0 is found in every frame, 1 in every second frame, 2 once, 3 never
         found = torch.tensor([0, 1 if turn % 2 else -1, 2 if turn == 0 else -1, -1])
         sparse_map.count_matches(found[found >= 0], torch.arange(4))
-    sparse_map.cull_landmarks()
+    cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"].all()
     insert(sparse_map, dict.fromkeys(range(4), 0))
-    sparse_map.cull_landmarks()
+    cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"].tolist() == [True, True, False, False]
 
 
@@ -177,12 +178,12 @@ def test_landmarks_without_a_second_observation_are_culled_after_three_keyframes
     sparse_map.insert_keyframe(0, 0.0, EYE, random_features(3), torch.full((3,), -1))
     for _ in range(2):
         insert(sparse_map, {1: 0})
-        sparse_map.cull_landmarks()
+        cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"].all()
     insert(sparse_map, {})
-    sparse_map.cull_landmarks()
+    cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"].tolist() == [False, True, False]
     sparse_map.remove_observations(torch.nonzero(sparse_map.observations["keyframe"] > 0)[:, 0])
     insert(sparse_map, {})
-    sparse_map.cull_landmarks()
+    cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"][1]  # it was confirmed

@@ -12,6 +12,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.mapping.covisibility import count_shared_landmarks
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_fusion import LandmarkFusion
 from v3d_torch.mapping.landmark_ids import merge_landmarks
@@ -90,7 +91,7 @@ def test_landmarks_of_one_point_are_merged_into_the_oldest() -> None:
     oldest = [min(room.landmarks_of(point)) for point in doubled]
     room.fuse()
     assert [room.landmarks_of(point) for point in doubled] == [{landmark} for landmark in oldest]
-    assert room.map.count_shared_landmarks(torch.tensor(oldest)).tolist() == 3 * [len(doubled)]
+    assert count_shared_landmarks(room.map, torch.tensor(oldest)).tolist() == 3 * [len(doubled)]
 
 
 def test_match_counters_of_merged_landmarks_are_added() -> None:

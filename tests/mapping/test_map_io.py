@@ -18,6 +18,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.mapping.covisibility import covisibility_edges
 from v3d_torch.mapping.keyframe import Loop
 from v3d_torch.mapping.map_columns import to_columns
 from v3d_torch.mapping.map_io import StoredMap, load_map, save_map
@@ -92,7 +93,7 @@ def test_loaded_map_equals_the_saved_map(keyframes: int, tmp_path: Path) -> None
     assert loaded.views.camera == stored.views.camera
     assert loaded.map.readout == stored.map.readout
     assert [view.keyframe for view in loaded.views] == loaded.map.keyframes
-    assert torch.equal(loaded.map.covisibility_edges(1), stored.map.covisibility_edges(1))
+    assert torch.equal(covisibility_edges(loaded.map, 1), covisibility_edges(stored.map, 1))
 
 
 def test_view_of_a_culled_keyframe_is_not_saved(tmp_path: Path) -> None:

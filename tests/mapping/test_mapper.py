@@ -8,6 +8,7 @@ import torch
 from helpers.sparse_maps import CAMERA, EYE, features
 
 from v3d_torch.config.loading import load_config
+from v3d_torch.mapping.covisibility import covisibility_edges
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
@@ -117,7 +118,7 @@ def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:
     while len(feed.mapper.map.keyframes) < 5:
         feed(300)
     assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 1, 1, 2, 2]
-    assert feed.mapper.map.covisibility_edges(1000).tolist() == [[1, 2], [3, 4]]
+    assert covisibility_edges(feed.mapper.map, 1000).tolist() == [[1, 2], [3, 4]]
 
 
 def test_part_that_a_lost_camera_starts_after_parts_were_joined_has_an_unused_id() -> None:

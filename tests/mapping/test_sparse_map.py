@@ -17,7 +17,10 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.mapping.covisibility import count_shared_landmarks, covisibility_edges, covisible_keyframes
+from v3d_torch.mapping.culling import cull_keyframes
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.mapping.landmark_ids import compact_landmarks
 from v3d_torch.mapping.map_observations import unique_ids
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout, compensate_features
@@ -104,18 +107,18 @@ def test_covisibility_equals_plain_counting(observed_sets: tuple[SparseMap, list
     sparse_map, sets = observed_sets
     wanted = {1, 5, 8, 13, 21, 34}
     counts = [len(wanted & observed) for observed in sets]
-    assert sparse_map.count_shared_landmarks(torch.tensor(sorted(wanted))).tolist() == counts
+    assert count_shared_landmarks(sparse_map, torch.tensor(sorted(wanted))).tolist() == counts
     newest_of_equals_first = sorted((k for k in range(12) if counts[k]), key=lambda k: (-counts[k], -k))
-    assert sparse_map.covisible_keyframes(torch.tensor(sorted(wanted)), 5).tolist() == newest_of_equals_first[:5]
+    assert covisible_keyframes(sparse_map, torch.tensor(sorted(wanted)), 5).tolist() == newest_of_equals_first[:5]
     pairs = [[i, j] for i in range(12) for j in range(i + 1, 12) if len(sets[i] & sets[j]) >= 7 or j == i + 1]
-    assert sparse_map.covisibility_edges(7).tolist() == pairs
+    assert covisibility_edges(sparse_map, 7).tolist() == pairs
 
 
 def test_consecutive_keyframes_of_different_parts_have_no_edge() -> None:
     sparse_map = make_map()
     for part in (0, 0, 1, 1, 2, 2, 0, 0):
         insert(sparse_map, []).part = part
-    assert sparse_map.covisibility_edges(1).tolist() == [[0, 1], [2, 3], [4, 5], [6, 7]]
+    assert covisibility_edges(sparse_map, 1).tolist() == [[0, 1], [2, 3], [4, 5], [6, 7]]
 
 
 @pytest.mark.parametrize(
@@ -136,7 +139,7 @@ def test_local_map_is_the_active_landmarks_of_the_most_covisible_keyframes(
 ) -> None:
     sparse_map, sets = observed_sets
     sparse_map.landmarks["active"][3] = False
-    best = sparse_map.covisible_keyframes(torch.tensor([2, 9]), 3).tolist()
+    best = covisible_keyframes(sparse_map, torch.tensor([2, 9]), 3).tolist()
     local = sparse_map.local_map(torch.tensor([2, 9]), 3)
     assert local.ids.tolist() == sorted(set.union(*(sets[k] for k in best)) - {3})
     assert torch.equal(local.points, sparse_map.landmarks["point"][local.ids])
@@ -153,10 +156,10 @@ def test_removed_observations_do_not_count(observed_sets: tuple[SparseMap, list[
     rows = torch.nonzero((table["keyframe"] == 4) & (table["landmark"] % 2 == 0))[:, 0]
     removed = table["landmark"][rows]
     kept = sparse_map.keyframes[4].landmarks[sparse_map.keyframes[4].landmarks % 2 == 1]
-    assert sparse_map.count_shared_landmarks(removed)[4] == len(removed) > 0
+    assert count_shared_landmarks(sparse_map, removed)[4] == len(removed) > 0
     sparse_map.remove_observations(rows)
-    assert sparse_map.count_shared_landmarks(removed)[4] == 0
-    assert sparse_map.count_shared_landmarks(kept)[4] == len(kept)
+    assert count_shared_landmarks(sparse_map, removed)[4] == 0
+    assert count_shared_landmarks(sparse_map, kept)[4] == len(kept)
     assert sparse_map.keyframes[4].landmarks[sparse_map.keyframes[4].landmarks >= 0].tolist() == kept.tolist()
 
 
@@ -169,14 +172,14 @@ def test_fused_landmarks_become_the_older_landmark(observed_sets: tuple[SparseMa
     assert newest.landmarks.tolist() == [4, 41, 7, 43, 44, 30]
     assert not sparse_map.landmarks["active"][duplicates].any()
     assert not torch.isin(sparse_map.observations["landmark"], torch.tensor(duplicates)).any()
-    counts = sparse_map.count_shared_landmarks(torch.tensor([4, 7, 30])).tolist()
+    counts = count_shared_landmarks(sparse_map, torch.tensor([4, 7, 30])).tolist()
     assert counts == [len({4, 7, 30} & observed) for observed in sets] + [3]
 
 
 def test_compaction_of_a_map_without_landmarks_changes_nothing() -> None:
     sparse_map = make_map()
     keyframe = sparse_map.insert_keyframe(0, 0.0, EYE, features(5, depth=0.0), unmatched(5))
-    sparse_map.compact([keyframe.landmarks.clone()])
+    compact_landmarks(sparse_map, [keyframe.landmarks.clone()])
     assert len(sparse_map.landmarks) == 0 and keyframe.landmarks.tolist() == [-1] * 5
 
 
@@ -304,7 +307,7 @@ def test_map_with_the_state_of_another_map_continues_like_that_map(
     for sparse_map in (original, restored):
         newest = sparse_map.insert_keyframe(12, 0.4, EYE, features(6, seed=50), unmatched(6))
         sparse_map.fuse_landmarks(newest, torch.tensor([4, -1, 7, -1, -1, 30]))
-        sparse_map.cull_keyframes({3: 0})
+        cull_keyframes(sparse_map, {3: 0})
         sparse_map.move_keyframes(se3_exp(torch.full((6,), 0.1, dtype=torch.float64)) @ sparse_map.T_cw)
         sparse_map.set_readout(Readout(0.03, 1e4))
     assert restored.keyframes is not original.keyframes and len(restored.keyframes) == 13 and len(restored.loops) == 1

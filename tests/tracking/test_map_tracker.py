@@ -11,6 +11,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
+from v3d_torch.mapping.culling import cull_landmarks
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 
@@ -85,7 +86,7 @@ def test_landmarks_occluded_for_many_frames_are_culled_only_without_depth(with_d
         tracking = wall.track(wall.features[~left], EYE, board_in_left_half(0.5) if with_depth else None)
         wall.map.count_matches(tracking.observed_landmarks, tracking.visible)
     wall.map.insert_keyframe(1, 1.0, EYE, wall.features[~left], tracking.landmarks)
-    wall.map.cull_landmarks()
+    cull_landmarks(wall.map)
     active = wall.map.landmarks["active"][wall.first.landmarks]
     assert active[~left].all()
     assert active[left].all() if with_depth else not active[left].any()

@@ -19,7 +19,7 @@ from torch import Tensor
 from v3d_torch.backend.loop_closer import LoopCloser, LoopCorrection
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.mapping.culling import cull_redundant_keyframes
+from v3d_torch.mapping.culling import cull_landmarks, cull_redundant_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -97,7 +97,7 @@ class BackEnd:
         T_new_old = None
         if result.loop_correction is not None:
             T_new_old = self._loop_closer.correct_loop(result.loop_correction, self._map)
-        self._map.cull_landmarks()
+        cull_landmarks(self._map)
         cull_redundant_keyframes(self._map, result.keyframe, self._config.mapping)
         self._loop_closer.remove_keyframes({keyframe.index for keyframe in self._map.keyframes if keyframe.is_culled})
         self._loop_closer.add_keyframe(result.keyframe)

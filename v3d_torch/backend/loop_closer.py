@@ -14,6 +14,7 @@ from v3d_torch.backend.pose_graph import optimise_pose_graph
 from v3d_torch.config import LoopConfig
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.mapping.covisibility import count_shared_landmarks, covisibility_edges
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
@@ -169,7 +170,7 @@ class LoopCloser:
         """Find a place whose keyframe is neither recent nor covisible; None soon after another loop."""
         if sparse_map.loops and keyframe.index - sparse_map.loops[-1].j < self._config.min_keyframe_gap:
             return None
-        covisible = sparse_map.count_shared_landmarks(keyframe.observed_landmarks).nonzero()[:, 0].tolist()
+        covisible = count_shared_landmarks(sparse_map, keyframe.observed_landmarks).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_keyframe_gap, keyframe.index + 1)
         for place in self._verified_places(keyframe.features, sparse_map, {*covisible, *recent}):
             if place.tracking.count >= self._config.min_inlier_ratio * len(place.tracking.visible):
@@ -178,7 +179,7 @@ class LoopCloser:
 
     def _optimise_poses(self, sparse_map: SparseMap, T_cw: Tensor, loops: Sequence[Loop]) -> Tensor:
         """Optimise the poses of the active keyframes by the pose graph of covisibility and loops, shape (K, 4, 4)."""
-        covisible = sparse_map.covisibility_edges(_MIN_SHARED_LANDMARKS)
+        covisible = covisibility_edges(sparse_map, _MIN_SHARED_LANDMARKS)
         T_covisible = T_cw[covisible[:, 0]] @ invert(T_cw[covisible[:, 1]])
         reference = sparse_map.references
         i, j = torch.tensor([[loop.i, loop.j] for loop in loops]).unbind(dim=1)

@@ -14,6 +14,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import to_measurements
 from v3d_torch.features.projection_matcher import ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_ids import contains
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -44,8 +45,8 @@ class LandmarkFusion:
             sparse_map: Map; its landmarks and observations are changed in place.
             keyframe: The newest keyframe.
         """
-        covisible = sparse_map.covisible_keyframes(
-            keyframe.observed_landmarks, self._config.mapping.fusion_keyframes + 1
+        covisible = covisible_keyframes(
+            sparse_map, keyframe.observed_landmarks, self._config.mapping.fusion_keyframes + 1
         ).tolist()
         neighbours = [sparse_map.keyframes[index] for index in covisible if index != keyframe.index]
         for neighbour in neighbours:

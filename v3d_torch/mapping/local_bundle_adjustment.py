@@ -11,6 +11,7 @@ from v3d_torch.config import Config, RollingShutterConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.bundle_adjustment import bundle_adjust
+from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.map_observations import select_observations
 from v3d_torch.mapping.readout_calibration import estimate_readout
@@ -77,7 +78,7 @@ def local_bundle_adjust(
     Returns:
         The result, or None if there are fewer than two keyframes or no observations to adjust.
     """
-    window = sparse_map.covisible_keyframes(keyframe.observed_landmarks, config.mapping.bundle_keyframes)
+    window = covisible_keyframes(sparse_map, keyframe.observed_landmarks, config.mapping.bundle_keyframes)
     selected = select_observations(sparse_map, window, config, with_neighbours=True)
     if len(window) < 2 or len(selected) == 0:
         return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,8 @@ from v3d_torch.features.features import Features
 from v3d_torch.features.projection_matcher import LocalMap
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, orthonormalise
-from v3d_torch.mapping import covisibility, culling, landmark_ids
+from v3d_torch.mapping import landmark_ids
+from v3d_torch.mapping.covisibility import covisible_keyframes, observed_landmarks
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_creation import create_landmarks, landmark_points, select_new_landmarks
 from v3d_torch.mapping.map_tables import MapTables
@@ -85,40 +85,6 @@ class SparseMap(MapTables):
             self.landmarks["found"][found] += 1
             self.landmarks["visible"][visible] += 1
 
-    def count_shared_landmarks(self, landmarks: Tensor) -> Tensor:
-        """Count the given landmarks that each keyframe observes.
-
-        Args:
-            landmarks: IDs, int64, shape :math:`(L,)`.
-
-        Returns:
-            Number of shared landmarks of each keyframe, int64, shape :math:`(K,)`.
-        """
-        return covisibility.count_shared_landmarks(self, landmarks)
-
-    def covisible_keyframes(self, landmarks: Tensor, count: int) -> Tensor:
-        """Find the keyframes that observe most of the given landmarks, best first.
-
-        Args:
-            landmarks: IDs, int64, shape :math:`(L,)`.
-            count: Maximum number of keyframes.
-
-        Returns:
-            Indices of keyframes that observe at least one of the landmarks, int64, shape :math:`(<= count,)`.
-        """
-        return covisibility.covisible_keyframes(self, landmarks, count)
-
-    def covisibility_edges(self, min_shared: int) -> Tensor:
-        """Find the edges of the pose graph; see `covisibility.covisibility_edges`.
-
-        Args:
-            min_shared: Minimum number of landmarks that a covisible pair shares.
-
-        Returns:
-            Pairs of keyframe indices (i, j), i < j, sorted, int64, shape :math:`(E, 2)`.
-        """
-        return covisibility.covisibility_edges(self, min_shared)
-
     def local_map(self, landmarks: Tensor, count: int) -> LocalMap:
         """Return the local map: all landmarks that the most covisible keyframes observe.
 
@@ -126,7 +92,7 @@ class SparseMap(MapTables):
             landmarks: IDs of the landmarks that the previous frame observed, int64, shape :math:`(L,)`.
             count: Maximum number of keyframes.
         """
-        return self.select_landmarks(covisibility.observed_landmarks(self, self.covisible_keyframes(landmarks, count)))
+        return self.select_landmarks(observed_landmarks(self, covisible_keyframes(self, landmarks, count)))
 
     def select_landmarks(self, landmarks: Tensor) -> LocalMap:
         """Return the active landmarks among the given ones as a local map.
@@ -246,26 +212,6 @@ class SparseMap(MapTables):
         keyframes, features = self.observations["keyframe"][rows], self.observations["feature"][rows]
         for index in keyframes.unique().tolist():
             self.keyframes[index].landmarks[features[keyframes == index]] = -1
-
-    def cull_landmarks(self) -> None:
-        """Cull unreliable landmarks; see `culling.cull_landmarks`."""
-        culling.cull_landmarks(self)
-
-    def cull_keyframes(self, references: Mapping[int, int]) -> None:
-        """Cull the given keyframes; see `culling.cull_keyframes`.
-
-        Args:
-            references: Index of the reference keyframe of each culled keyframe, by the index of the culled keyframe.
-        """
-        culling.cull_keyframes(self, references)
-
-    def compact(self, external_ids: Iterable[Tensor]) -> None:
-        """Remove unused landmarks from the table; see `landmark_ids.compact_landmarks`.
-
-        Args:
-            external_ids: Landmark IDs stored outside of the map, -1 for none, int64; updated in place.
-        """
-        landmark_ids.compact_landmarks(self, external_ids)
 
     def _add_observations(self, keyframe: Keyframe, indices: Tensor, landmarks: Tensor) -> None:
         """Add observations by some features of a keyframe, given the landmark IDs of all its features."""

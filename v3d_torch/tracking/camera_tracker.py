@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.features.features import Features
+from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.odometry import CameraMotion
@@ -95,7 +96,7 @@ class CameraTracker:
             poses: Poses of all earlier frames.
         """
         keyframes = self._map.keyframes
-        best = self._map.covisible_keyframes(pose.observed_landmarks, 1)
+        best = covisible_keyframes(self._map, pose.observed_landmarks, 1)
         if len(best):
             return keyframes[int(best[0])]
         return poses.keyframe or (keyframes[-1] if keyframes else None)
