@@ -43,7 +43,7 @@ def exports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, C
     dense = POINTS[3:].float(), torch.from_numpy(COLOURS[3:])
     for name, camera in CAMERAS.items():
         folder = tmp_path_factory.mktemp(name)
-        assert write_colmap(folder, camera, posed_images(camera), dense, make_tracks(camera)) == len(T_WC)
+        write_colmap(folder, camera, posed_images(camera), dense, make_tracks(camera))
         models[name] = folder, read_model(folder / "sparse" / "0", POINTS.numpy())
     return models
 

@@ -29,7 +29,7 @@ def write_colmap(
     images: Iterable[PosedImage],
     points: tuple[Tensor, Tensor],
     tracks: LandmarkTracks,
-) -> int:
+) -> None:
     """Write ``images/``, ``masks/`` and the model ``sparse/0``: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 
     Masks have the names that COLMAP expects: the name of the image with ``.png`` appended.
@@ -41,9 +41,6 @@ def write_colmap(
         points: Points of the static map without image points: positions, world frame, metres, and RGB, uint8, shape
             :math:`(N, 3)` each.
         tracks: Landmarks with their observations in the images.
-
-    Returns:
-        Number of images.
 
     Raises:
         OutputError: If a file cannot be written.
@@ -68,7 +65,6 @@ def write_colmap(
         + _landmark_lines(tracks, colours, _reprojection_errors(camera, tracks, uv, T_cw))
         + _point_lines(*points, first_id=len(tracks.points) + 1),
     )
-    return len(poses)
 
 
 def _camera_line(camera: PinholeCamera) -> str:

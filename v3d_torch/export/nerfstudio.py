@@ -24,7 +24,7 @@ _OPENGL_AXES = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
 """Signs of the camera's axes in OpenGL: x right, y up, z backwards."""
 
 
-def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[PosedImage], points: Path) -> int:
+def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[PosedImage], points: Path) -> None:
     """Write a folder for nerfstudio: ``images/``, ``masks/``, ``depths/``, ``points.ply`` and ``transforms.json``.
 
     Args:
@@ -32,9 +32,6 @@ def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[Posed
         camera: Camera of the images.
         images: Images.
         points: PLY file with the static map, which is copied.
-
-    Returns:
-        Number of images.
 
     Raises:
         ConfigError: If nerfstudio does not have the distortion model of the camera, ``rational_polynomial``.
@@ -57,7 +54,6 @@ def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[Posed
         "frames": frames,
     }
     write_text(folder / "transforms.json", json.dumps(transforms, indent=1) + "\n")
-    return len(frames)
 
 
 def _lens(camera: PinholeCamera) -> dict[str, Any]:

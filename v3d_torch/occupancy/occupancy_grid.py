@@ -36,22 +36,6 @@ class OccupancyGrid:
     T_lw: Tensor
     height: float
 
-    def states_at(self, points: Tensor) -> Tensor:
-        """State of the cell below each point.
-
-        Args:
-            points: Points, world frame, metres, shape :math:`(..., 3)`.
-
-        Returns:
-            Values of `VoxelState`, int8, shape :math:`(...)`; unknown outside of the grid.
-        """
-        level = points.to(torch.float64) @ self.T_lw[:3, :3].T
-        column, row = ((level[..., :2] - level.new_tensor(self.origin)) / self.cell_size).floor().long().unbind(dim=-1)
-        inside = (row >= 0) & (row < self.states.shape[0]) & (column >= 0) & (column < self.states.shape[1])
-        states = torch.full_like(row, VoxelState.UNKNOWN, dtype=torch.int8)
-        states[inside] = self.states[row[inside], column[inside]]
-        return states
-
 
 def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, float] | None = None) -> OccupancyGrid:
     """Project an occupancy map onto its floor.

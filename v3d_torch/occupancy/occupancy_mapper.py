@@ -66,11 +66,6 @@ class OccupancyMapper:
         self._rebuilt: OccupancyMap | None = None
         self._rebuilt_views = 0
 
-    @property
-    def is_rebuilding(self) -> bool:
-        """True while the map is rebuilt after a correction of the poses."""
-        return self._rebuilt is not None
-
     def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up: UpDirection | None = None) -> None:
         """Add a frame, if it is due and its pose is known.
 
