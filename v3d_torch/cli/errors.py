@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from v3d_torch.cli.program import exit_on_interrupt
+from v3d_torch.cli.interrupt import exit_on_interrupt
 from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, V3DError
 from v3d_torch.io.text import printable
 

@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from v3d_torch.cli.interrupt import exit_on_interrupt
 
 _INTERRUPTED = 130
 """Exit code of Typer after Ctrl-C, without a message."""
-
-
-@contextmanager
-def exit_on_interrupt() -> Iterator[None]:
-    """Report Ctrl-C as one line on stderr, and exit with code 2."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        print("error: interrupted before the results were written", file=sys.stderr)
-        sys.exit(2)
 
 
 def main() -> None:
