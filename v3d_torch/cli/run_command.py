@@ -94,8 +94,8 @@ class Display:
             from v3d_torch.export.ros.bag_viewer import BagViewer  # slow: loads the definitions of all messages
 
             viewers.append(BagViewer(self.bag, sequence.camera))
-        viewers.append(make_viewer(self.viz, self.rerun_file, sequence))  # last, because it creates its file
-        return ViewerGroup(viewers)
+        viewer = make_viewer(self.viz, self.rerun_file, sequence)  # last, because it creates its file
+        return ViewerGroup(viewers if viewer is None else [*viewers, viewer])
 
 
 def start_run(request: RunRequest, out: Path | None, display: Display) -> None:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from v3d_torch.pipeline.pipeline import NULL_VIEWER, FrameCallback, NullViewer, Pipeline, Viewer, ViewerGroup
+from v3d_torch.pipeline.pipeline import FrameCallback, Pipeline
 from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable, RunRecord, Snapshot, StateTable
+from v3d_torch.pipeline.viewer import Viewer, ViewerGroup
 
 __all__ = [
-    "NULL_VIEWER",
     "FrameCallback",
     "FrameTimes",
     "LiveTable",
-    "NullViewer",
     "ObjectTable",
     "Pipeline",
     "RunRecord",

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sized
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
@@ -18,7 +18,7 @@ from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import InputError, OutputError, V3DError
+from v3d_torch.errors import InputError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.live.live_slam import LiveSLAM
@@ -26,9 +26,9 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
 from v3d_torch.pipeline.run_record import RunRecord, Snapshot
+from v3d_torch.pipeline.viewer import Viewer, ViewerGroup
 from v3d_torch.reconstruction.point_map import PointMap, fuse_points
 from v3d_torch.runtime.process import trim_memory, trim_memory_at_intervals
-from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.runtime.stopwatch import Stopwatch
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus
@@ -46,82 +46,6 @@ not repeated."""
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
 
-class Viewer(Protocol):
-    """Viewer of a run. A viewer never changes the state of the SLAM system."""
-
-    def show(
-        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
-    ) -> None:
-        """Show a tracked frame.
-
-        Args:
-            frame: Images of the frame.
-            objects: Objects of the frame, and its static mask.
-            slam: SLAM system after it tracked the frame; its last pose is the pose of the frame.
-            stage_times: Time that each stage spent on the frame.
-        """
-
-    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
-        """Show the final map and trajectory, and close files and connections.
-
-        Args:
-            slam: SLAM system after the last frame.
-            point_map: Point map of the static scene.
-
-        Raises:
-            OutputError: If the recording cannot be written.
-        """
-
-
-class NullViewer:
-    """Viewer that shows nothing."""
-
-    def show(
-        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
-    ) -> None:
-        """Do nothing."""
-
-    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
-        """Do nothing."""
-
-
-NULL_VIEWER = NullViewer()
-"""Viewer for runs without a viewer."""
-
-
-class ViewerGroup:
-    """Several viewers of one run.
-
-    Args:
-        viewers: Viewers.
-    """
-
-    def __init__(self, viewers: Sequence[Viewer]) -> None:
-        self._viewers = viewers
-
-    def show(
-        self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: Mapping[str, StageTime]
-    ) -> None:
-        """Show a tracked frame in all viewers."""
-        for viewer in self._viewers:
-            viewer.show(frame, objects, slam, stage_times)
-
-    def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
-        """Finish all viewers, even if one of them fails.
-
-        Raises:
-            OutputError: The errors of all viewers, in one line.
-        """
-        errors = []
-        for viewer in self._viewers:
-            try:
-                viewer.finish(slam, point_map)
-            except OutputError as error:
-                errors.append(str(error))
-        if errors:
-            raise OutputError("; ".join(errors))
-
-
 class Pipeline:
     """Runs a sequence through the system.
 
@@ -131,7 +55,7 @@ class Pipeline:
         masks: Folder for an image per frame of the pixels that tracking excludes; None for no images.
         map_masks: Folder for an image per frame of the pixels that maps exclude: those of `masks`, and all people; None
             for no images.
-        viewer: Viewer that shows each frame.
+        viewer: Viewer that shows each frame; None for no viewer.
         views: Views of the keyframes of a known map; None to start without views.
         evaluate_masks: True to compare the masks with true masks, if the sequence has any.
         skip_broken: True to skip broken frames of a stored sequence, see `ReadableFrames`.
@@ -149,7 +73,7 @@ class Pipeline:
         sequence: RGBDStream,
         slam: V3DSLAM,
         masks: Path | None = None,
-        viewer: Viewer = NULL_VIEWER,
+        viewer: Viewer | None = None,
         views: StaticViews | None = None,
         *,
         map_masks: Path | None = None,
@@ -163,7 +87,7 @@ class Pipeline:
         self.between_frames = True
         self._mask_folders = masks, map_masks
         self._live = LiveSLAM(sequence, slam) if isinstance(sequence, LiveStream) else None
-        self._viewer = viewer
+        self._viewer = ViewerGroup(()) if viewer is None else viewer
         self._with_mask_evaluation = evaluate_masks
         self._skip_broken = skip_broken
         self._snapshot_step = 1

@@ -21,7 +21,7 @@ from v3d_torch.io.files import write_text
 from v3d_torch.mapping.map_io import StoredMap, save_map
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.odometry.rolling_shutter import Readout
-from v3d_torch.pipeline import NULL_VIEWER, FrameCallback, Pipeline, Viewer
+from v3d_torch.pipeline import FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.numerics_check import CheckedSLAM
@@ -48,7 +48,7 @@ class Run:
         sequence: Frames.
         segment: Segmenter.
         folder: Folder of the results; it exists.
-        viewer: Viewer that shows each frame.
+        viewer: Viewer that shows each frame; None for no viewer.
         known_map: Map of an earlier run in which the camera is localised; None to start a new map.
         checkpoint: Checkpoint of the same run to resume from; None to start with the first frame.
         save_checkpoints: False to save no checkpoints.
@@ -67,7 +67,7 @@ class Run:
         segment: Segmenter,
         folder: Path,
         *,
-        viewer: Viewer = NULL_VIEWER,
+        viewer: Viewer | None = None,
         known_map: StoredMap | None = None,
         checkpoint: Checkpoint | None = None,
         save_checkpoints: bool = True,

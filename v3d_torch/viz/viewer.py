@@ -6,11 +6,11 @@ from pathlib import Path
 
 from v3d_torch.datasets.base import RGBDStream
 from v3d_torch.errors import ConfigError, ViewerError
-from v3d_torch.pipeline import NULL_VIEWER, Viewer
+from v3d_torch.pipeline import Viewer
 
 
-def make_viewer(viz: str | None, rerun_file: Path | None, sequence: RGBDStream) -> Viewer:
-    """Create the viewer of a run.
+def make_viewer(viz: str | None, rerun_file: Path | None, sequence: RGBDStream) -> Viewer | None:
+    """Create the viewer of a run; None if no option asks for one.
 
     Args:
         viz: ``rerun`` to show the run while it is processed; None for no window.
@@ -25,7 +25,7 @@ def make_viewer(viz: str | None, rerun_file: Path | None, sequence: RGBDStream) 
     if viz not in (None, "rerun"):
         raise ConfigError(f"--viz {viz}: unknown viewer; use --viz rerun")
     if viz is None and rerun_file is None:
-        return NULL_VIEWER
+        return None
     try:
         import rerun  # noqa: F401
     except ImportError as error:
