@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from io import StringIO
 from statistics import geometric_mean, median
 from typing import NamedTuple
 
-from rich.markup import escape
 from rich.table import Table
 
 from v3d_torch.config.loading import FULL
+from v3d_torch.evaluation import tables
 from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
 from v3d_torch.evaluation.paper_tables import HEADINGS
 from v3d_torch.evaluation.summary import make_error_tables
-from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, format_median_and_range, markdown_row
+from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, format_markdown_table, format_median_and_range
 
 VARIANTS = (
     "baseline",
@@ -88,17 +89,9 @@ COLUMNS: Mapping[str, Column] = {
 
 def make_screen_table(outcomes: Sequence[Outcome]) -> Table:
     """Return the results on one sequence for the screen, one row per variant, the best of each error in green."""
-    headings, rows = _summarise(outcomes)
-    sequence = outcomes[0].sequence
-    label = label_sequence(sequence, find_difference(outcomes, sequence))
-    table = Table(title=f"Ablation on {escape(label)}", caption=conclusion(outcomes))
-    table.add_column("variant", no_wrap=True)
-    for heading in headings:
-        table.add_column(heading, justify="right", overflow="fold")
-    for variant, cells in rows.items():
-        texts = [cell.text.replace(" ", "\n") for cell in cells]  # put the range below the median
-        table.add_row(variant, *(f"[green]{t}[/]" if c.best else t for t, c in zip(texts, cells, strict=True)))
-    return table
+    table = _make_table(outcomes)
+    shown = replace(table, heading=f"Ablation on {table.heading}")
+    return tables.make_screen_table(shown, "variant", conclusion(outcomes))
 
 
 def format_markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
@@ -111,12 +104,8 @@ def format_markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
     lines = ["# Ablation", LEGEND, "", PAPER_RESULTS, "", *([note] if note else [])]
     for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
         runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
-        headings, rows = _summarise(runs)
-        label = label_sequence(sequence, find_difference(runs, sequence))
-        lines += ["", f"## {label}", f"Seeds: {len({run.seed for run in runs})}. {conclusion(runs)}", ""]
-        lines += [markdown_row(["variant", *headings]), markdown_row(["---", *["---:"] * len(headings)])]
-        for variant, cells in rows.items():
-            lines.append(markdown_row([variant, *(f"**{cell.text}**" if cell.best else cell.text for cell in cells)]))
+        seeds = f"Seeds: {len({run.seed for run in runs})}. {conclusion(runs)}"
+        lines += format_markdown_table(_make_table(runs), "variant", seeds)
         lines += ["", *(f"- {run}" for run in runs if run.failure is not None)]
     return "\n".join(lines) + "\n"
 
@@ -132,12 +121,12 @@ def make_overview_table(outcomes: Sequence[Outcome], absent: Sequence[str] = ())
         Table with one column per variant. The last two rows are the geometric mean of the ratio, over the sequences on
         which both were run, and the ratio according to the paper. None if no run has an ATE.
     """
-    tables = [
+    found = [
         table for table in make_error_tables(outcomes, papers=(), absent=absent) if table.heading == HEADINGS["ate"]
     ]
-    if not tables:
+    if not found:
         return None
-    (ate,) = tables
+    (ate,) = found
     paper = {variant: f"{PAPER_RATIOS[variant]:.2f}" for variant in ate.methods if variant in PAPER_RATIOS}
     ratios = {
         _RATIO_ROW: tuple(Cell(_ratio_to_full(outcomes, variant), best=False) for variant in ate.methods),
@@ -187,8 +176,8 @@ def conclusion(outcomes: Sequence[Outcome]) -> str:
     return f"The full system is worse than {best}: their ranges over the seeds do not overlap."
 
 
-def _summarise(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[Cell]]]:
-    """Return the headings and a row of cells for each variant, without the metrics that no run has."""
+def _make_table(outcomes: Sequence[Outcome]) -> ErrorTable:
+    """Return the results on one sequence, one row per variant, without the metrics that no run has."""
     headings: list[str] = []
     rows: dict[str, list[Cell]] = {outcome.config: [] for outcome in outcomes}
     for key, column in COLUMNS.items():
@@ -205,7 +194,9 @@ def _summarise(outcomes: Sequence[Outcome]) -> tuple[list[str], dict[str, list[C
         headings.append("failed")
         for variant, count in failed.items():
             rows[variant].append(Cell(str(count), best=False))
-    return headings, rows
+    sequence = outcomes[0].sequence
+    label = label_sequence(sequence, find_difference(outcomes, sequence))
+    return ErrorTable(label, tuple(headings), {variant: tuple(cells) for variant, cells in rows.items()})
 
 
 def _by_variant(outcomes: Sequence[Outcome], key: str) -> Iterator[tuple[str, list[float]]]:

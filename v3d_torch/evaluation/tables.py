@@ -40,12 +40,13 @@ class Cell(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorTable:
-    """Table of one metric.
+    """Table of one metric, or of all metrics on one sequence.
 
     Attributes:
-        heading: Name and unit of the metric.
-        methods: Column headings: the configurations, then the methods of the paper.
-        rows: For each sequence, one cell per method. The lowest value of a row, as printed, is the best.
+        heading: Name and unit of the metric, or name of the sequence.
+        methods: Column headings: the configurations, then the methods of the paper; or the metrics.
+        rows: For each sequence, one cell per method. The lowest value of a row, as printed, is the best. Or for each
+            configuration, one cell per metric, and the best value of a column.
     """
 
     heading: str
@@ -81,12 +82,18 @@ def markdown_row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
-def format_markdown_table(table: ErrorTable) -> list[str]:
-    """Return the lines of a Markdown section with the table, marked values in bold."""
-    lines = ["", f"## {table.heading}", "", markdown_row(["sequence", *table.methods])]
+def format_markdown_table(table: ErrorTable, first_heading: str = "sequence", note: str = "") -> list[str]:
+    """Return the lines of a Markdown section with the table, marked values in bold.
+
+    Args:
+        table: Table.
+        first_heading: Heading of the column with the names of the rows.
+        note: Text above the table.
+    """
+    lines = ["", f"## {table.heading}", *([note] if note else []), "", markdown_row([first_heading, *table.methods])]
     lines.append(markdown_row(["---", *["---:"] * len(table.methods)]))
-    for sequence, cells in table.rows.items():
-        lines.append(markdown_row([sequence, *(f"**{cell.text}**" if cell.is_bold else cell.text for cell in cells)]))
+    for name, cells in table.rows.items():
+        lines.append(markdown_row([name, *(f"**{cell.text}**" if cell.is_bold else cell.text for cell in cells)]))
     return lines
 
 
@@ -108,17 +115,23 @@ def format_latex_table(table: ErrorTable, legend: str) -> list[str]:
     return [*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table*}"]
 
 
-def make_screen_table(table: ErrorTable) -> Table:
-    """Return the table for the screen, the best values in green, and those that are significantly worse in magenta."""
-    shown = Table(title=table.heading, box=box.SIMPLE_HEAD)
-    shown.add_column("sequence", no_wrap=True)
+def make_screen_table(table: ErrorTable, first_heading: str = "sequence", note: str = "") -> Table:
+    """Return the table for the screen, the best values in green, and those that are significantly worse in magenta.
+
+    Args:
+        table: Table.
+        first_heading: Heading of the column with the names of the rows.
+        note: Text below the table.
+    """
+    shown = Table(title=escape(table.heading), caption=note or None, box=box.SIMPLE_HEAD)
+    shown.add_column(first_heading, no_wrap=True)
     for method in table.methods:
         shown.add_column(escape(method).replace(" (", "\n("), justify="right", overflow="fold")
-    for sequence, cells in table.rows.items():
+    for name, cells in table.rows.items():
         # Put the range below the median, and the number of failed runs below the range.
         texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
         marked = [f"[{cell.style}]{t}[/]" if cell.style else t for t, cell in zip(texts, cells, strict=True)]
-        shown.add_row(escape(sequence.replace(" (", "\n(")), *marked)
+        shown.add_row(escape(name.replace(" (", "\n(")), *marked)
     return shown
 
 
