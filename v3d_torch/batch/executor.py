@@ -11,6 +11,7 @@ from typing import Protocol
 
 from v3d_torch.batch.job import Job
 from v3d_torch.errors import OutputError
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import log_to
 
 _LOG = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ def report_lost_process(job: Job, reason: str) -> JobFinished:
     Returns:
         The end of the job.
     """
-    with suppress(OutputError), log_to(job.folder / "run.log", append=True):
+    with suppress(OutputError), log_to(job.folder / RunFile.LOG, append=True):
         _LOG.error(reason)
     return JobFinished(job, reason)
 
