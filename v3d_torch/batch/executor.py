@@ -17,7 +17,13 @@ from v3d_torch.runs.log import log_to
 _LOG = logging.getLogger(__name__)
 
 ONE_THREAD_ENVIRONMENT = dict.fromkeys(
-    (*("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "OPENCV_FOR_THREADS_NUM", "RAYON_NUM_THREADS"),
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "OPENCV_FOR_THREADS_NUM",
+        "RAYON_NUM_THREADS",
+    ),
     "1",
 )
 """Environment variables of a job that shares its machine with other jobs: libraries start no threads."""

@@ -319,7 +319,15 @@ class PoseRefiner(torch.nn.Module):
         See :func:`refine_pose`.
         """
         return refine_pose(
-            *(T_cw, points, uv, K, inverse_depth, self.pixel_sigma, self.inverse_depth_sigma, weights, valid),
+            T_cw,
+            points,
+            uv,
+            K,
+            inverse_depth,
+            pixel_sigma=self.pixel_sigma,
+            inverse_depth_sigma=self.inverse_depth_sigma,
+            weights=weights,
+            valid=valid,
             rounds=self.rounds,
             iterations=self.iterations,
             tolerance=self.tolerance,

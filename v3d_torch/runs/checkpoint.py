@@ -31,23 +31,21 @@ from v3d_torch.runs.state import STATE_CLASSES
 
 _CLASSES = (
     *STATE_CLASSES,
-    *(
-        RunRecord,
-        BrokenFrame,
-        FrameTimes,
-        LiveTable,
-        RepeatedImages,
-        ObjectTable,
-        StateTable,
-        Snapshot,
-        FrameObjects,
-        FrameResult,
-        TrackedObject,
-        MotionState,
-        MaskEvaluation,
-        StaticView,
-        set,
-    ),
+    RunRecord,
+    BrokenFrame,
+    FrameTimes,
+    LiveTable,
+    RepeatedImages,
+    ObjectTable,
+    StateTable,
+    Snapshot,
+    FrameObjects,
+    FrameResult,
+    TrackedObject,
+    MotionState,
+    MaskEvaluation,
+    StaticView,
+    set,
 )
 """Classes that a checkpoint can contain."""
 

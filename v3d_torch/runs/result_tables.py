@@ -26,9 +26,9 @@ from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import Trajectory
 
 _STATE_COLUMNS = (
-    *("vx", "vy", "vz", "position_sigma", "velocity_sigma"),
-    *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
-)
+    "vx", "vy", "vz", "position_sigma", "velocity_sigma",
+    "box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw",
+)  # fmt: skip
 """Columns of velocity, uncertainty and box of an object."""
 
 _DYNAMICS = pa.schema(
