@@ -21,7 +21,7 @@ from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
-from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_marquardt
+from v3d_torch.optim.levenberg_marquardt import POSE_TOLERANCE, OptimisationResult, levenberg_marquardt
 from v3d_torch.runtime.batches import common_batch
 
 _COARSE_INVERSE_DEPTH_SIGMA = 0.02
@@ -33,9 +33,6 @@ _MIN_INLIER_RATIO = 0.75
 
 _MIN_CORRELATION = 0.9
 """Minimum correlation of the brightness of both views. Unlike a residual, it does not depend on exposure."""
-
-_TOLERANCE = 1e-3
-"""Relative change of the cost at convergence. Convergence is quadratic, so the next step would change far less."""
 
 
 class DenseAlignment(NamedTuple):
@@ -210,7 +207,9 @@ class DenseAligner(torch.nn.Module):
         for halvings in self._halvings:
             sigma = self._config.inverse_depth_sigma if halvings == finest else _COARSE_INVERSE_DEPTH_SIGMA
             problem = AlignmentProblem(a.levels[halvings], b.levels[halvings], state, sigma, self._config)
-            result = levenberg_marquardt(state, problem.linearise, step, self._config.iterations, tolerance=_TOLERANCE)
+            result = levenberg_marquardt(
+                state, problem.linearise, step, self._config.iterations, tolerance=POSE_TOLERANCE
+            )
             state = result.state
         return self._summarise(problem, result)
 
