@@ -16,6 +16,13 @@ from v3d_torch.kernels import landmark_projection as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.optim.reprojection import MIN_DEPTH
 
+_MIN_COSINE = 0.5
+"""Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
+
+_LEVEL_MARGIN = 1.2
+"""Number of levels beyond either end of the pyramid at which landmarks are still matched: the expected level is
+rounded, and descriptors tolerate a difference of one level."""
+
 
 @dataclass(frozen=True)
 class LocalMap:
@@ -73,22 +80,15 @@ class ProjectionMatcher:
         camera: Intrinsics.
     """
 
-    _MIN_COSINE = 0.5
-    """Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
-
-    _LEVEL_MARGIN = 1.2
-    """Number of levels beyond either end of the pyramid at which landmarks are still matched: the expected level is
-    rounded, and descriptors tolerate a difference of one level."""
-
     def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._scale = pyramid.scale
         self._levels = pyramid.levels
         self._camera = camera
         # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower bounds are inclusive.
-        margin = self._LEVEL_MARGIN
+        margin = _LEVEL_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
-        lower = [MIN_DEPTH, u_min, v_min, self._MIN_COSINE, -margin]
+        lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, -margin]
         upper = [math.inf, u_max, v_max, math.inf, pyramid.levels - 1 + margin]
         self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
 

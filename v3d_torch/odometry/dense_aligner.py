@@ -34,6 +34,13 @@ _MIN_INLIER_RATIO = 0.75
 _MIN_CORRELATION = 0.9
 """Minimum correlation of the brightness of both views. Unlike a residual, it does not depend on exposure."""
 
+_MIN_CONTRAST = 2e-3
+"""Minimum standard deviation of brightness on the coarsest level: half an 8-bit step."""
+
+_MAX_DEPTH_SIGMAS = 5.0
+"""Maximum difference at which depths agree, in standard deviations of inverse depth. It is large because the delay
+between colour and depth, and depth edges, make the residuals heavy-tailed."""
+
 
 class DenseAlignment(NamedTuple):
     """Motion between two views found by dense alignment, with measures of its quality.
@@ -120,13 +127,6 @@ class DenseAligner(torch.nn.Module):
         config: Pyramid levels, noise, limits of the quality.
         camera: Camera of both views, with lens distortion. Levels with fewer than 2 rows or columns are skipped.
     """
-
-    _MIN_CONTRAST = 2e-3
-    """Minimum standard deviation of brightness on the coarsest level: half an 8-bit step."""
-
-    _MAX_DEPTH_SIGMAS = 5.0
-    """Maximum difference at which depths agree, in standard deviations of inverse depth. It is large because the delay
-    between colour and depth, and depth edges, make the residuals heavy-tailed."""
 
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
         super().__init__()
@@ -220,7 +220,7 @@ class DenseAligner(torch.nn.Module):
         greys = [grey[grey.isfinite()].to(torch.float64) for grey in greys]
         mean_a, mean_b = (grey.mean() for grey in greys)
         contrast_a, contrast_b = ((grey - grey.mean()).square().mean().sqrt() for grey in greys)
-        if not min(contrast_a, contrast_b) > self._MIN_CONTRAST:  # also true for NaN, if no pixel is static
+        if not min(contrast_a, contrast_b) > _MIN_CONTRAST:  # also true for NaN, if no pixel is static
             return None
         gain = contrast_b / contrast_a
         return torch.stack([gain, mean_b - gain * mean_a])
@@ -229,9 +229,7 @@ class DenseAligner(torch.nn.Module):
         T_ba, (gain, _) = orthonormalise(result.state[0]), result.state[1]
         residuals, config = problem.residuals(result.state), self._config
         (brightness, inverse_depth), valid_brightness = problem.reference.values.to(torch.float64), residuals.valid[0]
-        inliers = residuals.valid[1] & (
-            residuals.values[1].abs() <= self._MAX_DEPTH_SIGMAS * config.inverse_depth_sigma
-        )
+        inliers = residuals.valid[1] & (residuals.values[1].abs() <= _MAX_DEPTH_SIGMAS * config.inverse_depth_sigma)
         rms = [r[v].square().mean().sqrt() for r, v in zip(residuals.values, residuals.valid, strict=True)]
         information = problem.information(result.system, valid_brightness)
         scale = torch.ones_like(information[0])
