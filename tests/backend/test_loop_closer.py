@@ -337,10 +337,10 @@ def test_loop_joins_the_disconnected_part_of_the_map() -> None:
     for k in range(BEFORE_LOOP):
         camera.step(room, lap_pose(k), part=int(k > 12))
     assert camera.loop_closer.loop_count == 0
-    assert any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
     while camera.corrections[-1] is None:
         camera.step(room, lap_pose(len(camera.true_poses)), part=1)
-    assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert not any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
 
 
 def test_loop_corrects_a_wrong_guess_without_deforming_the_map() -> None:
@@ -375,7 +375,7 @@ def test_loop_of_a_camera_that_was_lost_twice_joins_only_the_part_at_its_end() -
     while camera.loop_closer.loop_count < 2:
         camera.step(room, lap_pose(len(camera.true_poses)))
     assert 8 <= camera.map.loops[1].i < 16
-    assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert not any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
     assert camera.errors().max() < 0.1
 
 

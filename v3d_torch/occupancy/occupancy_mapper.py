@@ -184,4 +184,4 @@ class OccupancyMapper:
 def _is_reliable(poses: PoseHistory) -> bool:
     """Check whether the pose of the last frame is known relative to the whole map."""
     is_found = poses.status in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
-    return is_found and not (poses.keyframe is not None and poses.keyframe.disconnected)
+    return is_found and not (poses.keyframe is not None and poses.keyframe.is_disconnected)
