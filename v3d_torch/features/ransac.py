@@ -150,7 +150,7 @@ def pnp_ransac(
 
 
 def _squared_errors(T_cw: Tensor, points: Tensor, uv: Tensor, K: Tensor) -> Tensor:
-    """Squared reprojection errors, pixels, (..., N); infinite for points behind the camera."""
+    """Squared reprojection errors, square pixels, (..., N); infinite for points behind the camera."""
     in_camera = points @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]
     xy = in_camera[..., :2] / in_camera[..., 2:].clamp(min=MIN_DEPTH)
     error = (xy * K.diagonal(dim1=-2, dim2=-1)[..., None, :2] + K[..., None, :2, 2] - uv).square().sum(dim=-1)

@@ -175,9 +175,8 @@ class DenseAligner(torch.nn.Module):
             self._align(self.view(grey_a, depth_a, static_a), self.view(grey_b, depth_b, static_b), T_ba)
             for grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b in zip(*columns, strict=True)
         ]
-        failed = _failed_alignment(
-            grey_a.device
-        )  # starts with an extra element, dropped below, so that an empty batch can be stacked
+        # The rows start with an extra element, dropped below, so that an empty batch can be stacked.
+        failed = _failed_alignment(grey_a.device)
         rows = [failed, *(failed if alignment is None else alignment for alignment in alignments)]
         stacked = (torch.stack(list(column))[1:] for column in zip(*rows, strict=True))
         return DenseAlignment(*(column.reshape((*batch, *column.shape[1:])) for column in stacked))
