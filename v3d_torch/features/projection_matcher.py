@@ -53,13 +53,13 @@ class ProjectedLandmarks:
         indices: Indices of the landmarks in the local map, int64, shape :math:`(V,)`.
         uv: Undistorted pixels, float64, shape :math:`(V, 2)`.
         depth: Depth along z, metres, float64, shape :math:`(V,)`.
-        levels: Expected levels of the scale pyramid, int64, shape :math:`(V,)`.
+        octave: Expected octaves, int64, shape :math:`(V,)`.
     """
 
     indices: Tensor
     uv: Tensor
     depth: Tensor
-    levels: Tensor
+    octave: Tensor
 
 
 def _project_compiled(self: ProjectionMatcher, T_cw: Tensor, local_map: LocalMap) -> ProjectedLandmarks:
@@ -109,8 +109,8 @@ class ProjectionMatcher:
         """
         pairs = match_by_projection(
             projection.uv,
-            radius * self._scale ** projection.levels.to(torch.float64),
-            projection.levels,
+            radius * self._scale ** projection.octave.to(torch.float64),
+            projection.octave,
             local_map.descriptors.index_select(0, projection.indices),
             features.uv,
             features.octave,
@@ -143,5 +143,5 @@ class ProjectionMatcher:
         lower, upper = self._bounds[..., None]
         rows = torch.nonzero(((predicted >= lower) & (predicted < upper)).all(dim=0))[:, 0]
         z, u, v, _, level = predicted.index_select(1, rows)
-        levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
-        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, levels)
+        octave = level.round().clamp(0, self._levels - 1).to(torch.int64)
+        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, octave)
