@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.random_numbers import RandomNumbers
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
@@ -48,11 +49,7 @@ class Room:
 
     def observe(self, T_wc: Tensor, seed: int) -> tuple[Features, Tensor]:
         """Features observed from a pose, with noise on pixels, depth and bits, and the indices of their points."""
-        generator = torch.Generator().manual_seed(seed)
-
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+        random = RandomNumbers(seed)
         T_cw = invert(T_wc)
         points = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
         uv = CAMERA.project(torch.where(points[:, 2:] > 0.5, points, -1.0))
@@ -60,13 +57,13 @@ class Room:
         distance = points[visible].norm(dim=1)
         octave = (torch.log(6.0 / distance) / math.log(1.2)).round().clamp(0, 7).long()
         z = points[visible, 2]
-        flipped = torch.rand(len(z), 32, 8, generator=generator) < 0.02
+        flipped = torch.rand(len(z), 32, 8, generator=random.generator) < 0.02
         flips = (flipped * 2 ** torch.arange(8)).sum(dim=-1).to(torch.uint8)
-        uv = uv[visible] + 0.3 * normal(len(z), 2)
+        uv = uv[visible] + 0.3 * random.normal(len(z), 2)
         features = Features(
             uv=uv,
             pixel=uv.round().long().clamp(min=0).minimum(torch.tensor([639, 479])),
-            depth=z + 0.002 * z**2 * normal(len(z)),
+            depth=z + 0.002 * z**2 * random.normal(len(z)),
             octave=octave,
             descriptors=self.descriptors[visible] ^ flips,
         )
