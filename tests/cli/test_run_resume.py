@@ -9,6 +9,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,12 +17,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.bag_messages import read_with_mcap
-from helpers.commands import assert_error_line
+from helpers.commands import assert_error_line, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from helpers.forked_command import start_forked
 from helpers.walker_folder import write_walker
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
@@ -56,8 +57,7 @@ def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:
     return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", "--occupancy", *more]
 
 
-def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(run.app, [str(argument) for argument in arguments])
+call = partial(invoke, run.app)
 
 
 @pytest.fixture(scope="module")
