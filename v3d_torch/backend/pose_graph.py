@@ -202,7 +202,8 @@ def _minimise_compiled(T_wc: Tensor, *graph: Tensor, iterations: int, tolerance:
         return NotImplemented
     settings = float(limit), iterations, tolerance, _REGULARISATION, DAMPING_SCHEDULE
     rows = zip(*(to_rows(each, batch) for each in (T_wc, *columns)), strict=True)
-    return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*row, *settings) for row in rows], batch))
+    problems = [(*row, *settings) for row in rows]
+    return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*problem) for problem in problems], batch))
 
 
 @compiled_by(_minimise_compiled)
