@@ -18,6 +18,7 @@ from rich.console import Console
 from v3d_torch.io.paths import cache_dir
 
 if TYPE_CHECKING:
+    from v3d_torch.datasets import RGBDSequence
     from v3d_torch.datasets.demo.scene import Scene
 
 # Threads that wait for each other would keep cores busy that other workers of the tests need. Read by torch's OpenMP.
@@ -93,6 +94,14 @@ def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequences") / "moment"
     copy_frames(folder, range(52, 58))
     return folder
+
+
+@pytest.fixture(scope="module")
+def demo() -> RGBDSequence:
+    """Sequence of the demo."""
+    from v3d_torch.datasets import load_sequence
+
+    return load_sequence("demo")
 
 
 @pytest.fixture(scope="session")

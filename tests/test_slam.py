@@ -15,7 +15,7 @@ from helpers.walk_run import Walk, segment_red
 from PIL import Image
 from torch import Tensor
 
-from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame, load_sequence
+from v3d_torch import V3DSLAM, FrameResult, PinholeCamera, RGBDFrame
 from v3d_torch.backend.back_end import BackEndResult
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
@@ -30,11 +30,6 @@ from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.types import FramePose, TrackingStatus
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))
-
-
-@pytest.fixture(scope="module")
-def demo() -> RGBDSequence:
-    return load_sequence("demo")
 
 
 def test_call_returns_pose_status_and_objects_of_the_frame(demo: RGBDSequence) -> None:

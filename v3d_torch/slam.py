@@ -60,9 +60,9 @@ from v3d_torch.tracking.state_history import StateHistory
 from v3d_torch.types import FramePose, Instances, RGBDFrame, Segmenter, TrackingStatus
 
 _STATEFUL = (
-    *("timer", "map", "poses", "estimate_state", "states", "motion_model", "free_space_check", "classify_motion"),
-    *("mapper", "loop_closer", "back_end", "occupancy", "up_estimator"),
-)
+    "timer", "map", "poses", "estimate_state", "states", "motion_model", "free_space_check", "classify_motion",
+    "mapper", "loop_closer", "back_end", "occupancy", "up_estimator",
+)  # fmt: skip
 """Names of the attributes with state that changes from frame to frame."""
 
 

@@ -127,12 +127,12 @@ class RGBDFrame:
         )
 
 
-def _array(image: object) -> NDArray[Any]:
-    """Return an image as an array; floating-point tensors become float32, because NumPy lacks some of their dtypes."""
-    if isinstance(image, Tensor):
-        image = image.detach()
-        return (image.to(torch.float32) if image.is_floating_point() else image).numpy()
-    return np.asarray(image)
+def _array(values: object) -> NDArray[Any]:
+    """Return an image or a vector as an array; float tensors become float32: NumPy lacks some of their dtypes."""
+    if isinstance(values, Tensor):
+        values = values.detach()
+        return (values.to(torch.float32) if values.is_floating_point() else values).numpy()
+    return np.asarray(values)
 
 
 def _unit_vector(vector: NDArray[Any], index: int) -> Tensor:

@@ -18,7 +18,7 @@ from v3d_torch.datasets.demo.renderer import Renderer
 from v3d_torch.datasets.demo.scenes import SCENES
 from v3d_torch.datasets.demo.sequence import CAMERA, FRAME_RATE, SEED
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation.masks import STATIC, UNSURE, MaskEvaluation
+from v3d_torch.evaluation.masks import MIN_FRACTION_IN_VIEW, STATIC, UNSURE
 
 IGNORED = 255
 """Value of the pixels in `TruePeople.owner` that are not evaluated."""
@@ -78,7 +78,7 @@ def true_people(sequence: RGBDSequence, frames: int | None = None, *, correct_id
             pixels[id_of_value[value]] += int(measured[value])
         masks.append(mask)
         ids_of_values.append(id_of_value)
-        enough = MaskEvaluation.MIN_FRACTION_IN_VIEW * mask.size
+        enough = MIN_FRACTION_IN_VIEW * mask.size
         in_view.append({id_ for id_, count in pixels.items() if id_ not in (STATIC, UNSURE) and count >= enough})
     rate = (len(sequence) - 1) / float(sequence.stamps[-1] - sequence.stamps[0])
     frames_of = Counter(id_ for people in in_view for id_ in people)

@@ -17,7 +17,7 @@ from helpers.walk_run import make_pipeline
 from torch import Tensor
 
 import v3d_torch.backend.back_end
-from v3d_torch import V3DSLAM, load_sequence
+from v3d_torch import V3DSLAM
 from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCorrection
 from v3d_torch.config import Config
@@ -28,11 +28,6 @@ from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bun
 from v3d_torch.pipeline import Pipeline
 
 FRAMES = 6
-
-
-@pytest.fixture(scope="module")
-def demo() -> RGBDSequence:
-    return load_sequence("demo")
 
 
 def make_config(*, in_background: bool) -> Config:

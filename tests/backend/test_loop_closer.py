@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.random_numbers import RandomNumbers
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
@@ -50,11 +51,7 @@ class Room:
 
     def observe(self, T_wc: Tensor, seed: int) -> tuple[Features, Tensor]:
         """Features observed from a pose, with noise on pixels, depth and bits, and the indices of their points."""
-        generator = torch.Generator().manual_seed(seed)
-
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+        random = RandomNumbers(seed)
         T_cw = invert(T_wc)
         points = self.points @ T_cw[:3, :3].T + T_cw[:3, 3]
         uv = CAMERA.project(torch.where(points[:, 2:] > 0.5, points, -1.0))
@@ -62,13 +59,13 @@ class Room:
         distance = points[visible].norm(dim=1)
         octave = (torch.log(6.0 / distance) / math.log(1.2)).round().clamp(0, 7).long()
         z = points[visible, 2]
-        flipped = torch.rand(len(z), 32, 8, generator=generator) < 0.02
+        flipped = torch.rand(len(z), 32, 8, generator=random.generator) < 0.02
         flips = (flipped * 2 ** torch.arange(8)).sum(dim=-1).to(torch.uint8)
-        uv = uv[visible] + 0.3 * normal(len(z), 2)
+        uv = uv[visible] + 0.3 * random.normal(len(z), 2)
         features = Features(
             uv=uv,
             pixel=uv.round().long().clamp(min=0).minimum(torch.tensor([639, 479])),
-            depth=z + 0.002 * z**2 * normal(len(z)),
+            depth=z + 0.002 * z**2 * random.normal(len(z)),
             octave=octave,
             descriptors=self.descriptors[visible] ^ flips,
         )
@@ -339,10 +336,10 @@ def test_loop_joins_the_disconnected_part_of_the_map() -> None:
     for k in range(BEFORE_LOOP):
         camera.step(room, lap_pose(k), part=int(k > 12))
     assert camera.loop_closer.loop_count == 0
-    assert any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
     while camera.corrections[-1] is None:
         camera.step(room, lap_pose(len(camera.true_poses)), part=1)
-    assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert not any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
 
 
 def test_loop_corrects_a_wrong_guess_without_deforming_the_map() -> None:
@@ -377,7 +374,7 @@ def test_loop_of_a_camera_that_was_lost_twice_joins_only_the_part_at_its_end() -
     while camera.loop_closer.loop_count < 2:
         camera.step(room, lap_pose(len(camera.true_poses)))
     assert 8 <= camera.map.loops[1].i < 16
-    assert not any(keyframe.disconnected for keyframe in camera.map.keyframes)
+    assert not any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
     assert camera.errors().max() < 0.1
 
 

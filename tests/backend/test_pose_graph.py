@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers import camera_inputs
 from helpers.gradients import check_gradients, count_graph_nodes
+from helpers.random_numbers import RandomNumbers
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -26,21 +27,17 @@ class Graph:
     """Poses on two laps of a circle, noisy relative poses between them, and initial poses that drift."""
 
     def __init__(self, poses: int, loops: int, noise: float = 1.0, seed: int = 0) -> None:
-        generator = torch.Generator().manual_seed(seed)
-
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
+        random = RandomNumbers(seed)
         angle = torch.linspace(0, 4 * math.pi, poses, dtype=torch.float64)
         o = torch.zeros_like(angle)
         place = torch.stack([2 * angle.cos(), 2 * angle.sin(), 0.2 * (3 * angle).sin(), o, o, o], dim=1)
         turn = torch.stack([o, o, o, o, o, angle], dim=1)
-        self.T_wc = se3_exp(place) @ se3_exp(turn) @ se3_exp(0.1 * normal(poses, 6))
+        self.T_wc = se3_exp(place) @ se3_exp(turn) @ se3_exp(0.1 * random.normal(poses, 6))
         chain = torch.stack([torch.arange(poses - 1), torch.arange(1, poses)], dim=1)
-        ends = torch.randint(0, poses, (loops, 2), generator=generator)
+        ends = torch.randint(0, poses, (loops, 2), generator=random.generator)
         self.edges = torch.cat([chain, ends[ends[:, 0] != ends[:, 1]]])
         i, j = self.edges.unbind(dim=1)
-        error = noise * SIGMA * normal(len(i), 6)
+        error = noise * SIGMA * random.normal(len(i), 6)
         self.T_ij = invert(self.T_wc[i]) @ self.T_wc[j] @ se3_exp(error)
         self.information = torch.diag(SIGMA**-2).expand(len(i), 6, 6)
         drifting = [self.T_wc[0]]

@@ -8,7 +8,7 @@ from pathlib import Path
 from helpers.batches import plan_seeds, repeat_sequence
 
 from v3d_torch.batch.run_job import run_job
-from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.result_folder import lock_results
 
 
@@ -29,7 +29,7 @@ def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tm
     (first,) = plan_seeds(repeat_sequence(moment, tmp_path / "old" / "long", frames=8), tmp_path / "out", seeds=1)
     progress, report = stop_after(4)
     assert run_job(first, report) is not None
-    assert progress == [1, 2, 3, 4] and (first.folder / CHECKPOINT).is_file()
+    assert progress == [1, 2, 3, 4] and (first.folder / RunFile.CHECKPOINT).is_file()
     (tmp_path / "old").rename(tmp_path / "new")
     (moved,) = plan_seeds(tmp_path / "new" / "long", tmp_path / "out", seeds=1)
     assert moved.folder == first.folder and moved.source != first.source

@@ -8,13 +8,13 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers.commands import assert_error_line, call_here
-from typer.testing import CliRunner, Result
+from helpers.commands import assert_error_line, call_here, invoke
 
 from v3d_torch.batch import ablation_study
 from v3d_torch.cli.ablate import app
@@ -32,9 +32,7 @@ from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 FRAMES = 6
 
 
-def call(*arguments: str | Path) -> Result:
-    environment = {"V3D_DATA": "", "NO_COLOR": "1", "COLUMNS": "80"}
-    return CliRunner().invoke(app, list(map(str, arguments)), env=environment)
+call = partial(invoke, app, V3D_DATA="", NO_COLOR="1", COLUMNS="80")
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

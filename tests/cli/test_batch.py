@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
+from functools import partial
 from pathlib import Path
 from threading import Event
 
@@ -21,8 +22,8 @@ import psutil
 import pytest
 import yaml
 from helpers.batches import plan_seeds, repeat_sequence
-from helpers.commands import RUN_FILES, assert_error_line, files_in
-from typer.testing import CliRunner, Result
+from helpers.commands import RUN_FILES, assert_error_line, files_in, invoke
+from typer.testing import Result
 
 from v3d_torch.batch import runner
 from v3d_torch.batch.batch_record import METRIC_TYPES
@@ -46,9 +47,8 @@ def environment() -> dict[str, str]:
     return own | {"OMP_NUM_THREADS": "1", "NO_COLOR": "1"}
 
 
-def call(*arguments: str | Path) -> Result:
-    """Call the command in this process; its runs have processes of their own."""
-    return CliRunner().invoke(app, list(map(str, arguments)), env={"V3D_DATA": "", "NO_COLOR": "1"})
+call = partial(invoke, app, V3D_DATA="", NO_COLOR="1")
+"""Call the command in this process; its runs have processes of their own."""
 
 
 def metrics_of(folder: Path) -> dict:

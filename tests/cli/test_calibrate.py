@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import cv2
 import pytest
-from helpers.commands import assert_error_line
+from helpers.commands import assert_error_line, invoke
 from helpers.demo_frames import copy_frames
-from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import calibrate
 from v3d_torch.datasets import load_sequence
@@ -25,8 +25,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(calibrate.app, list(map(str, arguments)), env={"COLUMNS": "200"})
+call = partial(invoke, calibrate.app, COLUMNS="200")
 
 
 @pytest.mark.parametrize(("factor", "features"), [(1.15, 500), (0.5, 1500)])

@@ -6,11 +6,12 @@ import inspect
 import json
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from typer.testing import CliRunner, Result
+from helpers.commands import invoke
 
 from v3d_torch.cli.evaluate import app, main
 from v3d_torch.datasets.tum_extents import EXTENTS
@@ -33,8 +34,7 @@ def files(tmp_path: Path) -> tuple[str, str]:
     return str(tmp_path / "groundtruth.txt"), str(tmp_path / "estimate.txt")
 
 
-def call(*arguments: str) -> Result:
-    return CliRunner().invoke(app, list(arguments), env={"COLUMNS": "120", "NO_COLOR": "1"})
+call = partial(invoke, app, COLUMNS="120", NO_COLOR="1")
 
 
 def test_json_from_the_shell(files: tuple[str, str]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from contextlib import chdir
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -14,9 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers.colmap_reader import read_model
-from helpers.commands import assert_error_line, files_in
+from helpers.commands import assert_error_line, files_in, invoke
 from helpers.demo_frames import copy_frames
-from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import export, run
 from v3d_torch.datasets import load_sequence, tum_writer
@@ -46,7 +46,7 @@ def results(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(sequence, folder / "walk")
     arguments = "--seq walk --segmenter masks --masks walk/masks --save-masks --save-map room.npz --out out"
     with chdir(folder):
-        done = CliRunner().invoke(run.app, [*arguments.split(), "--set", "mapping.max_keyframe_interval=4"])
+        done = invoke(run.app, *arguments.split(), "--set", "mapping.max_keyframe_interval=4")
     assert (done.exit_code, done.stderr) == (0, "")
     return folder / "out"
 
@@ -63,8 +63,7 @@ def colmap(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(export.app, list(map(str, arguments)), env={"COLUMNS": "200"})
+call = partial(invoke, export.app, COLUMNS="200")
 
 
 @pytest.mark.parametrize("is_new", [True, False])
@@ -182,7 +181,7 @@ def test_broken_frames_that_the_run_skipped_are_left_out(sequence: Path, tmp_pat
     broken = sorted((tmp_path / "walk" / "rgb").iterdir())[2]
     broken.write_bytes(b"")
     arguments = f"--seq {tmp_path / 'walk'} --segmenter none --skip-broken --save-masks --out {tmp_path / 'run'}"
-    assert CliRunner().invoke(run.app, arguments.split()).exit_code == 0
+    assert invoke(run.app, *arguments.split()).exit_code == 0
     done = call(tmp_path / "run", "--format", "tum", "--out", tmp_path / "out")
     assert (done.exit_code, done.stderr) == (0, "")
     original, static = load_sequence(str(sequence)), load_sequence(str(tmp_path / "out"))

@@ -9,16 +9,16 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 from helpers.bags import DEPTH, INFO, RGB, MessageFactory
-from helpers.commands import assert_error_line
+from helpers.commands import assert_error_line, invoke
 from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of, save
 from helpers.walls import CAMERA, Slide
 from rich.console import Console
-from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.record import app
 from v3d_torch.cli.record_command import record_all
@@ -34,9 +34,7 @@ def command(*arguments: str | Path) -> list[str]:
     return [sys.executable, "-m", "v3d_torch", "record", *map(str, arguments)]
 
 
-def call(*arguments: str | Path) -> Result:
-    """Call the command in this process, which has imported everything already."""
-    return CliRunner().invoke(app, list(map(str, arguments)))
+call = partial(invoke, app)
 
 
 def assert_equal(saved: RGBDSequence, source: RGBDSequence) -> None:

@@ -11,16 +11,17 @@ import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 import torch
+from helpers.commands import invoke
 from helpers.squares import squares
 from helpers.wall_run import FRAMES, Wall, square
 from torch import Tensor
-from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.report import app
 from v3d_torch.config.loading import load_config
@@ -109,9 +110,7 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=120)  # noqa: S603
 
 
-def call_here(*arguments: str | Path) -> Result:
-    """Call the command in this process, which has loaded the libraries already."""
-    return CliRunner().invoke(app, list(map(str, arguments)))
+call_here = partial(invoke, app)
 
 
 def page_of(folder: Path, groundtruth: Path | None = None) -> Page:

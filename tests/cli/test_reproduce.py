@@ -16,8 +16,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from helpers.commands import assert_error_line
-from typer.testing import CliRunner, Result
+from helpers.commands import assert_error_line, invoke
 
 from v3d_torch.batch import reproduction
 from v3d_torch.batch.executor import JobFinished
@@ -40,8 +39,7 @@ class Handler(SimpleHTTPRequestHandler):
         pass
 
 
-def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(app, list(map(str, arguments)), env={"V3D_DATA": "", "NO_COLOR": "1"})
+call = partial(invoke, app, V3D_DATA="", NO_COLOR="1")
 
 
 def table_in(document: str, heading: str) -> dict[str, dict[str, str]]:

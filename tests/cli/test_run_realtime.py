@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from helpers.commands import assert_error_line, command
+from helpers.commands import assert_error_line, command, invoke
 from helpers.demo_frames import copy_frames
 from helpers.forked_command import start_forked
 from helpers.walker_folder import write_walker
 from helpers.walls import Slide
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from v3d_torch.cli import run
 from v3d_torch.datasets.demo.sequence import FRAME_RATE
@@ -36,7 +36,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(run.app, command(*arguments)[3:], env={"COLUMNS": "120", "NO_COLOR": "1"})
+    return invoke(run.app, *command(*arguments)[3:], COLUMNS="120", NO_COLOR="1")
 
 
 def test_run_reports_latency_dropped_frames_and_accuracy(sequence: Path, tmp_path: Path) -> None:

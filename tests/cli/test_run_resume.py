@@ -9,6 +9,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -16,12 +17,12 @@ import numpy as np
 import pytest
 import torch
 from helpers.bag_messages import read_with_mcap
-from helpers.commands import assert_error_line
+from helpers.commands import assert_error_line, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from helpers.forked_command import start_forked
 from helpers.walker_folder import write_walker
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
@@ -34,7 +35,7 @@ from v3d_torch.io.state_file import VERSION
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import ViewerGroup
 from v3d_torch.runs import results
-from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import read_request
 from v3d_torch.runs.stored_run import read_run
@@ -56,8 +57,7 @@ def run_arguments(sequence: Path, out: Path, *more: str) -> list[str]:
     return ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), "--mesh", "--occupancy", *more]
 
 
-def call(*arguments: str | Path) -> Result:
-    return CliRunner().invoke(run.app, [str(argument) for argument in arguments])
+call = partial(invoke, run.app)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_run_killed_at_ten_frames_resumes_to_the_same_bytes(sequence: Path, whol
         partial = read_run(out)
         assert partial.trajectory is not None and len(partial.trajectory) == partial.metrics.processed >= frame - 2
         assert partial.metrics.failure is not None and partial.metrics.failure.startswith("killed or still running")
-        assert (out / CHECKPOINT).is_file()
+        assert (out / RunFile.CHECKPOINT).is_file()
         arguments = ["--resume", str(out)]
     process = start_forked(*arguments, cwd=tmp_path)
     process.join()
@@ -155,7 +155,7 @@ def test_interrupted_run_resumes_to_the_same_results(sequence: Path, whole_run: 
     """No checkpoint is due before Ctrl-C: the only one is written when the run ends."""
     done = interrupt_run(sequence, tmp_path / "out", 10, "--save-masks")
     assert_error_line(done, f"interrupted after 11 of {FRAMES} frames", f"; resume with --resume {tmp_path / 'out'})")
-    assert {CHECKPOINT, "map.ply"} <= {path.name for path in (tmp_path / "out").iterdir()}
+    assert {RunFile.CHECKPOINT, "map.ply"} <= {path.name for path in (tmp_path / "out").iterdir()}
     done = call("--resume", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert f"resuming after 11 of {FRAMES} frames" in done.stdout
@@ -169,7 +169,7 @@ def test_temporarily_full_disk_only_prevents_checkpoints(sequence: Path, whole_r
     out, limits = tmp_path / "out", resource.getrlimit(resource.RLIMIT_FSIZE)
 
     def free_disk() -> None:
-        assert (out / CHECKPOINT).stat().st_size > 10_000  # the complete checkpoint of frame 5
+        assert (out / RunFile.CHECKPOINT).stat().st_size > 10_000  # the complete checkpoint of frame 5
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
     with full_from_frame(6), at_frame(11, free_disk):
@@ -178,7 +178,7 @@ def test_temporarily_full_disk_only_prevents_checkpoints(sequence: Path, whole_r
     assert "note: no checkpoint" not in done.stdout  # later ones were saved
     assert (out / "run.log").read_text().count("WARNING no checkpoint: ") == 1
     assert (out / "trajectory.txt").read_bytes() == (whole_run / "trajectory.txt").read_bytes()
-    assert not list(out.glob(".*")) and not (out / CHECKPOINT).exists()
+    assert not list(out.glob(".*")) and not (out / RunFile.CHECKPOINT).exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no file size limits")
@@ -325,7 +325,7 @@ def test_recording_of_the_first_frames_is_not_replaced(out: Path) -> None:
     done = call("--resume", out, "--rerun", recording)
     assert_error_line(done, f"{recording}: already exists; delete it, or choose another file with --rerun")
     assert recording.read_text() == "the first frames"
-    assert (out / "metrics.json").read_bytes() == before and (out / CHECKPOINT).is_file()
+    assert (out / "metrics.json").read_bytes() == before and (out / RunFile.CHECKPOINT).is_file()
 
 
 def test_bag_of_a_resumed_run_has_the_remaining_frames_and_its_own_odom(out: Path, tmp_path: Path) -> None:
@@ -354,17 +354,18 @@ def test_missing_checkpoint_is_rejected_with_a_suggestion(tmp_path: Path) -> Non
     )
     newest = tmp_path / "seq" / "2026-01-01"
     newest.mkdir(parents=True)
-    (newest / CHECKPOINT).touch()
+    (newest / RunFile.CHECKPOINT).touch()
     assert_error_line(call("--resume", tmp_path), f"{tmp_path}: has no checkpoint; pass the newest run in it, {newest}")
     assert_error_line(
-        call("--resume", newest / CHECKPOINT), f"{newest / CHECKPOINT}: is not a folder; pass its folder, {newest}"
+        call("--resume", newest / RunFile.CHECKPOINT),
+        f"{newest / RunFile.CHECKPOINT}: is not a folder; pass its folder, {newest}",
     )
     done = call()
     assert done.exit_code == 2 and "--resume" in done.stderr
 
 
 def test_damaged_checkpoint_or_one_of_another_version_is_rejected(out: Path) -> None:
-    path = out / CHECKPOINT
+    path = out / RunFile.CHECKPOINT
     content = path.read_bytes()
     path.write_bytes(content[:-10])
     assert_error_line(call("--resume", out), f"{path}: is damaged or not a state of a run; start a new run")

@@ -13,11 +13,11 @@ from threading import Event
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from helpers.commands import assert_error_line
+from helpers.commands import assert_error_line, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame
 from helpers.walker_folder import write_walker
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 from v3d_torch.batch import runner
 from v3d_torch.batch.executor import JobFinished
@@ -55,8 +55,7 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def call(sequence: Path, out: Path, *more: str) -> Result:
-    arguments = ["--seq", str(sequence), "--masks", str(sequence / "ids"), "--out", str(out), *more]
-    return CliRunner().invoke(run.app, arguments, env={"COLUMNS": "400"})
+    return invoke(run.app, "--seq", sequence, "--masks", sequence / "ids", "--out", out, *more, COLUMNS="400")
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +110,7 @@ def test_interrupted_run_resumes_to_the_same_bytes(
 ) -> None:
     with at_frame(stop, lambda: os.kill(os.getpid(), signal.SIGINT)):
         assert_error_line(call(broken, tmp_path / "out", "--skip-broken"), "interrupted after")
-    done = CliRunner().invoke(run.app, ["--resume", str(tmp_path / "out")])
+    done = invoke(run.app, "--resume", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert_same_results(tmp_path / "out", serial[0])
 
@@ -121,7 +120,7 @@ def test_run_that_a_broken_frame_ended_resumes_and_passes_it_over(tmp_path: Path
     frame = sorted((sequence / "rgb").iterdir())[6]
     frame.write_bytes(frame.read_bytes()[:100])
     assert_error_line(call(sequence, out), str(frame), "the results of the 6 frames before", f"--resume {out}")
-    done = CliRunner().invoke(run.app, ["--resume", str(out), "--skip-broken"])
+    done = invoke(run.app, "--resume", out, "--skip-broken")
     assert done.exit_code == 0, done.stderr
     assert call(sequence, tmp_path / "expected", "--skip-broken").exit_code == 0
     assert_same_results(out, tmp_path / "expected")
@@ -176,7 +175,7 @@ def test_batch_passes_over_broken_frames_and_keeps_finished_runs(
 
     def call_batch(*more: str) -> Result:
         arguments = ["--seqs", str(good), str(bad), "--configs", "baseline", "--out", str(tmp_path / "out")]
-        return CliRunner().invoke(batch.app, [*arguments, *more], env={"V3D_DATA": "", "NO_COLOR": "1"})
+        return invoke(batch.app, *arguments, *more, V3D_DATA="", NO_COLOR="1")
 
     done = call_batch()
     assert_error_line(done, "1 of 2 runs failed")

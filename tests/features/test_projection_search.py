@@ -12,11 +12,11 @@ from v3d_torch.features.projection_search import match_by_projection
 
 
 def _match(projected: torch.Tensor, uv: torch.Tensor, a: torch.Tensor, b: torch.Tensor, **kwargs) -> list[list[int]]:
-    levels = kwargs.pop("levels", torch.zeros(len(projected), dtype=torch.int64))
+    landmark_octave = kwargs.pop("landmark_octave", torch.zeros(len(projected), dtype=torch.int64))
     octave = kwargs.pop("octave", torch.zeros(len(uv), dtype=torch.int64))
     radius = torch.full((len(projected),), 5.0)
     limits = {"max_hamming": 64, "max_ratio": 0.9, **kwargs}
-    return match_by_projection(projected, radius, levels, a, uv, octave, b, **limits).tolist()
+    return match_by_projection(projected, radius, landmark_octave, a, uv, octave, b, **limits).tolist()
 
 
 def test_projection_matching_finds_near_features_with_similar_descriptors() -> None:
@@ -37,9 +37,9 @@ def test_projection_matching_equals_exhaustive_search(seed: int, landmarks: int,
     uv = 50.0 * torch.randn(features, 2, generator=generator, dtype=torch.float64)
     radius = 100.0 * torch.rand(landmarks, generator=generator, dtype=torch.float64) ** 3
     a, b = random_descriptors(landmarks, seed), random_descriptors(features, seed + 1)
-    levels = torch.zeros(landmarks, dtype=torch.int64)
+    landmark_octave = torch.zeros(landmarks, dtype=torch.int64)
     octave = torch.zeros(features, dtype=torch.int64)
-    pairs = match_by_projection(projected, radius, levels, a, uv, octave, b, max_hamming=256, max_ratio=0.9)
+    pairs = match_by_projection(projected, radius, landmark_octave, a, uv, octave, b, max_hamming=256, max_ratio=0.9)
     by_feature: dict[int, list[tuple[int, int]]] = {}
     for i in range(landmarks):
         near = torch.nonzero((uv - projected[i]).norm(dim=1) <= radius[i])[:, 0]
@@ -54,8 +54,8 @@ def test_projection_matching_rejects_far_features_and_other_levels() -> None:
     uv, b = torch.tensor([[10.0, 10.0]]), random_descriptors(1, 1)
     assert _match(torch.tensor([[13.0, 14.0]]), uv, b, b) == [[0, 0]]
     assert _match(torch.tensor([[14.0, 14.0]]), uv, b, b) == []
-    assert _match(uv, uv, b, b, levels=torch.tensor([2])) == []
-    assert _match(uv, uv, b, b, levels=torch.tensor([1])) == [[0, 0]]
+    assert _match(uv, uv, b, b, landmark_octave=torch.tensor([2])) == []
+    assert _match(uv, uv, b, b, landmark_octave=torch.tensor([1])) == [[0, 0]]
 
 
 def test_landmark_with_two_similar_candidates_is_not_matched() -> None:

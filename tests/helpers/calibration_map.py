@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from helpers.random_numbers import RandomNumbers
 from helpers.sparse_maps import no_features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
@@ -41,21 +42,17 @@ def make_map(
         readout: Time from the first row to the last, seconds; the map assumes 0.
         seed: Seed of scene and noise.
     """
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    phase = 6.28 * torch.rand(6, generator=generator, dtype=torch.float64)
+    random = RandomNumbers(seed)
+    phase = 6.28 * random.uniform(6)
     time = torch.linspace(0, 6.28, keyframes, dtype=torch.float64)[:, None]
     T_cw = se3_exp(swing * torch.sin(time * torch.tensor([1.0, 1.3, 0.7, 1.1, 0.9, 1.5]) + phase))
-    uv = torch.rand(points, 2, generator=generator, dtype=torch.float64) * torch.tensor([640.0, 480.0])
-    world = true.back_project(uv, 1 + 3 * torch.rand(points, generator=generator, dtype=torch.float64))
+    uv = random.uniform(points, 2) * torch.tensor([640.0, 480.0])
+    world = true.back_project(uv, 1 + 3 * random.uniform(points))
     world = (invert(T_cw[keyframes // 2]) @ torch.cat([world, torch.ones(points, 1).double()], dim=1).T).T[:, :3]
     tables = MapTables()
     tables.readout = Readout(0.0, 1.0)
     tables.landmarks.append(
-        point=world + 0.01 * noise * normal(points, 3),
+        point=world + 0.01 * noise * random.normal(points, 3),
         direction=torch.zeros(points, 3).double(),
         reference_distance=torch.ones(points).double(),
         descriptor=torch.zeros(points, 32, dtype=torch.uint8),
@@ -68,11 +65,11 @@ def make_map(
         tables.keyframes.append(Keyframe(index, index, float(index), T_cw[index], no_features(), torch.zeros(0).long()))
         in_camera = world @ T_cw[index, :3, :3].T + T_cw[index, :3, 3]
         pixel, visible = true.project_to_image(in_camera, 0.3)
-        velocity = 300 * normal(1, 2).expand(points, 2)  # pixels per second, the same for all pixels of an image
+        velocity = 300 * random.normal(1, 2).expand(points, 2)  # pixels per second, the same for all pixels of an image
         jacobian = -(pixel[:, 1:] / 479 - 0.5) * velocity
-        measured = pixel - readout * jacobian + noise * PIXEL_SIGMA * normal(points, 2)
+        measured = pixel - readout * jacobian + noise * PIXEL_SIGMA * random.normal(points, 2)
         offset = given.inverse_depth_offset - true.inverse_depth_offset
-        inverse_depth = 1 / in_camera[:, 2] + offset + noise * INVERSE_DEPTH_SIGMA * normal(points)
+        inverse_depth = 1 / in_camera[:, 2] + offset + noise * INVERSE_DEPTH_SIGMA * random.normal(points)
         seen = torch.nonzero(visible)[:, 0]
         tables.observations.append(
             keyframe=torch.full_like(seen, index),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from helpers.random_numbers import RandomNumbers
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 
@@ -18,18 +19,12 @@ POSES, LANDMARKS = 3, 6
 Inputs = dict[str, Tensor]
 
 
-class _Random:
+class _Random(RandomNumbers):
     """Random numbers that depend on their order and the batch size only."""
 
     def __init__(self, batch: int, count: int) -> None:
+        super().__init__(seed=0)
         self.shape = batch, count
-        self.generator = torch.Generator().manual_seed(0)
-
-    def normal(self, *shape: int) -> Tensor:
-        return torch.randn(*shape, generator=self.generator, dtype=torch.float64)
-
-    def uniform(self, *shape: int) -> Tensor:
-        return torch.rand(*shape, generator=self.generator, dtype=torch.float64)
 
     def mask(self) -> Tensor:
         """Mask of about three quarters of the elements."""

@@ -8,6 +8,7 @@ import sys
 from contextlib import chdir
 from pathlib import Path
 
+from typer import Typer
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli import run
@@ -36,11 +37,16 @@ def call(*arguments: str | Path, cwd: Path, **variables: str) -> subprocess.Comp
     )
 
 
+def invoke(app: Typer, *arguments: str | Path, **variables: str | None) -> Result:
+    """Call any command in this process, with changes of the environment; None for variables that are not set."""
+    return CliRunner().invoke(app, list(map(str, arguments)), env=variables)
+
+
 def call_here(*arguments: str | Path, cwd: Path, **variables: str) -> Result:
-    """Call the command in this process, which has imported everything already."""
+    """Call the run command in this process, which has imported everything already."""
     with chdir(cwd):
-        return CliRunner().invoke(
-            run.app, command(*arguments)[3:], env={"V3D_DATA": None, "COLUMNS": "120", "NO_COLOR": "1", **variables}
+        return invoke(
+            run.app, *command(*arguments)[3:], **{"V3D_DATA": None, "COLUMNS": "120", "NO_COLOR": "1", **variables}
         )
 
 

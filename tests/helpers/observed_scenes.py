@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from helpers.random_numbers import RandomNumbers
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.bundle_adjustment import BundleAdjustment, bundle_adjust
@@ -28,37 +29,31 @@ class Scene:
     """
 
     def __init__(self, poses: int, points: int, observers: int, noise: float = 1.0, seed: int = 0) -> None:
-        generator = torch.Generator().manual_seed(seed)
-
-        def normal(*shape: int) -> Tensor:
-            return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, dtype=torch.float64)
-
+        random = RandomNumbers(seed)
         spread = torch.tensor([0.3, 0.2, 0.1, 0.05, 0.08, 0.05], dtype=torch.float64)
-        self.T_cw = se3_exp(normal(poses, 6) * spread)
-        uv = uniform(points, 2) * torch.tensor([640.0, 480.0], dtype=torch.float64)
-        self.points = CAMERA.back_project(uv, 1 + 3 * uniform(points))
-        pose = torch.stack([torch.randperm(poses, generator=generator)[:observers] for _ in range(points)]).flatten()
+        self.T_cw = se3_exp(random.normal(poses, 6) * spread)
+        uv = random.uniform(points, 2) * torch.tensor([640.0, 480.0], dtype=torch.float64)
+        self.points = CAMERA.back_project(uv, 1 + 3 * random.uniform(points))
+        orders = [torch.randperm(poses, generator=random.generator) for _ in range(points)]
+        pose = torch.stack([order[:observers] for order in orders]).flatten()
         point = torch.arange(points).repeat_interleave(observers)
         count = pose.shape[0]
         T = self.T_cw[pose]
         in_camera = (T[:, :3, :3] @ self.points[point, :, None])[..., 0] + T[:, :3, 3]
-        sigma = 1.2 ** torch.randint(0, 8, (count,), generator=generator).to(torch.float64)
-        inverse_depth = 1 / in_camera[:, 2] + noise * DEPTH_SIGMA * normal(count)
-        inverse_depth[uniform(count) < 0.3] = 0.0
+        sigma = 1.2 ** torch.randint(0, 8, (count,), generator=random.generator).to(torch.float64)
+        inverse_depth = 1 / in_camera[:, 2] + noise * DEPTH_SIGMA * random.normal(count)
+        inverse_depth[random.uniform(count) < 0.3] = 0.0
         self.measured = Measurements(
-            uv=CAMERA.project(in_camera) + noise * sigma[:, None] * normal(count, 2),
+            uv=CAMERA.project(in_camera) + noise * sigma[:, None] * random.normal(count, 2),
             inverse_depth=inverse_depth,
             pixel_sigma=sigma,
             inverse_depth_sigma=DEPTH_SIGMA,
         )
         self.pose, self.point = pose, point
         self.fixed = torch.arange(poses) == 0
-        error = 0.02 * normal(poses, 6)
+        error = 0.02 * random.normal(poses, 6)
         self.start = torch.where(self.fixed[:, None, None], self.T_cw, se3_exp(error) @ self.T_cw)
-        self.start_points = self.points + 0.02 * normal(points, 3)
+        self.start_points = self.points + 0.02 * random.normal(points, 3)
 
     @property
     def observations(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
+from helpers.folders import names_in
 
 from v3d_torch.errors import DownloadError, OutputError
 from v3d_torch.io.download import fetch
@@ -84,10 +85,6 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 @pytest.fixture
 def target(tmp_path: Path) -> Path:
     return tmp_path / "new" / "file.bin"
-
-
-def names_in(folder: Path) -> list[str]:
-    return sorted(entry.name for entry in folder.iterdir())
 
 
 def write_part(target: Path, content: bytes) -> Path:

@@ -8,13 +8,10 @@ import tarfile
 from pathlib import Path
 
 import pytest
+from helpers.folders import names_in
 
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.io.extract import extract_tar
-
-
-def names_in(folder: Path) -> list[str]:
-    return sorted(entry.name for entry in folder.iterdir())
 
 
 def write_archive(path: Path, *members: tuple[tarfile.TarInfo, bytes]) -> Path:

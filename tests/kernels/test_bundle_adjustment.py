@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.random_numbers import RandomNumbers
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
@@ -28,26 +29,22 @@ Problem = tuple[Tensor, Tensor, BundleProblem]
 
 def make_problem(poses: int, points: int, observations: int, fixed: list[int], seed: int = 0) -> Problem:
     """Observations of random points by random poses near the origin, with noise and outliers, in random order."""
-    generator = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=generator, dtype=torch.float64)
-
-    T_cw = se3_exp(0.1 * normal(poses, 6))
-    positions = 0.5 * normal(points, 3) + torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
+    random = RandomNumbers(seed)
+    T_cw = se3_exp(0.1 * random.normal(poses, 6))
+    positions = 0.5 * random.normal(points, 3) + torch.tensor([0.0, 0.0, 3.0], dtype=torch.float64)
     # Some pairs of a pose and a point occur twice.
-    pose = torch.randint(0, max(poses, 1), (observations,), generator=generator)
-    point = torch.randint(0, max(points, 1), (observations,), generator=generator)
+    pose = torch.randint(0, max(poses, 1), (observations,), generator=random.generator)
+    point = torch.randint(0, max(points, 1), (observations,), generator=random.generator)
     in_camera = (T_cw[pose, :3, :3] @ positions[point, :, None])[..., 0] + T_cw[pose, :3, 3]
-    uv = CAMERA.project(in_camera) + normal(observations, 2)
+    uv = CAMERA.project(in_camera) + random.normal(observations, 2)
     uv[::17] += 50.0
-    inverse_depth = 1 / in_camera[:, 2] + 0.003 * normal(observations)
+    inverse_depth = 1 / in_camera[:, 2] + 0.003 * random.normal(observations)
     inverse_depth[::3] = 0.0
     sigma = 1.2 ** (torch.arange(observations) % 5).double()
-    weights = torch.rand(observations, generator=generator, dtype=torch.float64)
+    weights = random.uniform(observations)
     weights[::5] = 0.0
     is_fixed = torch.isin(torch.arange(poses), torch.tensor(fixed, dtype=torch.int64))
-    start = se3_exp(0.01 * normal(poses, 6)) @ T_cw, positions + 0.02 * normal(points, 3)
+    start = se3_exp(0.01 * random.normal(poses, 6)) @ T_cw, positions + 0.02 * random.normal(points, 3)
     measured = uv, pose, point, CAMERA.K, inverse_depth, sigma, 0.003
     problem, state, _ = prepare_bundle(*start, *measured, is_fixed, weights, None)
     return *state, problem

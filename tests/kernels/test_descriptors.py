@@ -59,12 +59,12 @@ def test_projection_matching_equals_its_twin(landmarks: int, features: int, radi
         projected[0] = uv[0]
     if landmarks > 1:
         projected[1] = torch.nan
-    levels, octave = (torch.randint(0, 4, (count,), generator=generator) for count in (landmarks, features))
+    landmark_octave, octave = (torch.randint(0, 4, (count,), generator=generator) for count in (landmarks, features))
     pairs = assert_equal(
         NEAR,
         projected,
         torch.full((landmarks,), radius, dtype=torch.float64),
-        levels,
+        landmark_octave,
         descriptors(landmarks, 3),
         uv,
         octave,
@@ -77,6 +77,6 @@ def test_projection_matching_equals_its_twin(landmarks: int, features: int, radi
 
 def test_projection_matching_of_features_at_one_pixel_equals_its_twin() -> None:
     pixels = torch.full((20, 2), 7.0, dtype=torch.float64)
-    levels, radius = torch.zeros(20, dtype=torch.int64), torch.ones(20, dtype=torch.float64)
-    args = pixels, radius, levels, descriptors(20, 5), pixels, levels, descriptors(20, 6)
+    octave, radius = torch.zeros(20, dtype=torch.int64), torch.ones(20, dtype=torch.float64)
+    args = pixels, radius, octave, descriptors(20, 5), pixels, octave, descriptors(20, 6)
     assert_equal(NEAR, *args, max_hamming=64, max_ratio=1.0)

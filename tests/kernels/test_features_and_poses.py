@@ -82,7 +82,7 @@ def test_projection_of_a_local_map_equals_its_twin(count: int) -> None:
     twin = TWINS["v3d_torch.features.projection_matcher.ProjectionMatcher.project"]
     for T_cw in (torch.eye(4, dtype=torch.float64), se3_exp(torch.full((6,), 0.1, dtype=torch.float64))):
         found, expected = twin.compiled(matcher, T_cw, local_map), twin.torch(matcher, T_cw, local_map)
-        assert torch.equal(found.indices, expected.indices) and torch.equal(found.levels, expected.levels)
+        assert torch.equal(found.indices, expected.indices) and torch.equal(found.octave, expected.octave)
         torch.testing.assert_close(found.uv, expected.uv, rtol=1e-12, atol=1e-10)
         torch.testing.assert_close(found.depth, expected.depth, rtol=1e-12, atol=1e-12)
         assert count < 300 or len(found.indices)

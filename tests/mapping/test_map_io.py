@@ -264,7 +264,7 @@ def test_map_of_another_version_is_rejected_with_cause_and_fix(version: int, tmp
 def test_disconnected_keyframes_of_version_4_are_one_part(tmp_path: Path) -> None:
     stored = random_map()
     path = write_map(tmp_path, stored)
-    flags = np.array([keyframe.disconnected for keyframe in stored.map.keyframes])
+    flags = np.array([keyframe.is_disconnected for keyframe in stored.map.keyframes])
     header = changed_header(path, version=4)
     rewrite(path, about=header, keyframe__part=None, keyframe__disconnected=flags)
     loaded = load_map(path, CAMERA, CONFIG)

@@ -86,7 +86,7 @@ def test_map_continues_by_odometry_after_the_delay_and_stays_connected() -> None
         assert not feed(300)
     inserted = [feed(0, ODOMETRY) for _ in range(20)]
     assert inserted.index(True) in (9, 10)  # 0.3 s at 30 Hz
-    assert not feed.mapper.map.keyframes[-1].disconnected
+    assert not feed.mapper.map.keyframes[-1].is_disconnected
 
 
 def test_map_does_not_start_with_too_few_features() -> None:
@@ -101,9 +101,9 @@ def test_lost_camera_starts_a_disconnected_part_of_the_map_after_the_delay() -> 
     inserted = [feed(0, LOST) for _ in range(20)]
     assert inserted.index(True) in (15, 16)  # half a second at 30 Hz
     first, second = feed.mapper.map.keyframes[:2]
-    assert not first.disconnected and second.disconnected
+    assert not first.is_disconnected and second.is_disconnected
     feed(5)
-    assert feed.mapper.map.keyframes[-1].disconnected  # because its reference keyframe is
+    assert feed.mapper.map.keyframes[-1].is_disconnected  # because its reference keyframe is
 
 
 def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:

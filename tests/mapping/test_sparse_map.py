@@ -131,7 +131,7 @@ def test_joined_parts_have_the_lower_id(a: int, b: int, parts: list[int]) -> Non
     assert sparse_map.unused_part == 3
     sparse_map.join_parts(a, b)
     assert [keyframe.part for keyframe in sparse_map.keyframes] == parts
-    assert [keyframe.disconnected for keyframe in sparse_map.keyframes] == [part > 0 for part in parts]
+    assert [keyframe.is_disconnected for keyframe in sparse_map.keyframes] == [part > 0 for part in parts]
 
 
 def test_local_map_is_the_active_landmarks_of_the_most_covisible_keyframes(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config.loading import load_config
-from v3d_torch.datasets import RGBDSequence, load_sequence
+from v3d_torch.datasets import RGBDSequence
 from v3d_torch.evaluation import evaluate
 from v3d_torch.features.orb import ORB
 from v3d_torch.geometry.se3 import invert, se3_log
@@ -24,11 +24,6 @@ NO_MOTION = "odometry.max_speed=0.001"  # every measured motion is implausible
 PREDICTED_T_CP = torch.eye(4, dtype=torch.float64)
 PREDICTED_VELOCITY = torch.tensor([0.01, -0.02, 0.03, 0.04, -0.05, 0.06], dtype=torch.float64)  # m/s and rad/s
 PAIRS = torch.tensor([[4, 0], [2, 3], [0, 5]])
-
-
-@pytest.fixture(scope="module")
-def demo() -> RGBDSequence:
-    return load_sequence("demo")
 
 
 @dataclass(frozen=True)

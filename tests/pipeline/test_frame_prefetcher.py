@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.first_frames import FirstFrames
 
-from v3d_torch import V3DSLAM, RGBDFrame, load_sequence
+from v3d_torch import V3DSLAM, RGBDFrame
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.errors import InputError
@@ -23,11 +23,6 @@ from v3d_torch.types import Instances
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))
 FRAMES = 5
-
-
-@pytest.fixture(scope="module")
-def demo() -> RGBDSequence:
-    return load_sequence("demo")
 
 
 class RecordingSegmenter:

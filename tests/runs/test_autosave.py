@@ -15,7 +15,7 @@ from v3d_torch.errors import OutputError
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs import result_tables
 from v3d_torch.runs.autosave import Autosave
-from v3d_torch.runs.checkpoint import CHECKPOINT
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import RunRequest
 
@@ -56,7 +56,7 @@ def test_live_run_continues_while_files_are_written(
     written = (tmp_path / "trajectory.txt").read_text().splitlines()
     assert len(written) == FRAMES and len(calls) == 3  # of frames, keyframes and ground truth
     assert read_metrics(tmp_path / "metrics.json").failure == f"killed or still running after {FRAMES} frames"
-    assert (tmp_path / CHECKPOINT).is_file()
+    assert (tmp_path / RunFile.CHECKPOINT).is_file()
 
 
 def test_files_of_a_live_run_have_the_frames_at_the_time_of_the_save(

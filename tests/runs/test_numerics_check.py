@@ -43,11 +43,6 @@ class TimedNewlyOccupied(NewlyOccupied):
     seconds: float = 0.0
 
 
-@pytest.fixture(scope="module")
-def demo() -> RGBDSequence:
-    return load_sequence("demo")
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(
     ("make_value", "message"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import errno
 import subprocess
 import sys
@@ -12,7 +13,8 @@ import pytest
 from filelock import FileLock
 
 from v3d_torch.errors import OutputError
-from v3d_torch.runs import result_folder
+from v3d_torch.runs import file_names, result_folder
+from v3d_torch.runs.file_names import RunFile
 
 
 def test_runs_started_in_the_same_second_have_separate_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,3 +89,12 @@ def test_folder_on_a_file_system_without_locks_is_used_without_one(
     monkeypatch.setattr(FileLock, "acquire", refuse)
     with result_folder.lock_results(tmp_path / "out"):
         assert (tmp_path / "out").is_dir()
+
+
+def test_names_of_result_files_are_written_once() -> None:
+    """A file whose name is not in `RunFile` would stay when a folder is cleared."""
+    source = Path(file_names.__file__)
+    for path in (path for folder in ("runs", "batch", "cli") for path in (source.parents[1] / folder).glob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        names = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)} & set(RunFile)
+        assert path == source or not names, path

@@ -13,7 +13,8 @@ from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.io.state_file import write_state
-from v3d_torch.runs.checkpoint import CHECKPOINT, FileSizes, write_checkpoint
+from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
 
@@ -60,8 +61,8 @@ def test_checkpoint_is_not_loaded_as_the_state_of_a_system(tmp_path: Path) -> No
     pipeline = make_pipeline(prefetch=False)
     pipeline(interrupt_after(1))
     write_checkpoint(tmp_path, pipeline, RunRequest("walk", CONFIG), FileSizes(pipeline.sequence))
-    with pytest.raises(InputError, match=rf"{CHECKPOINT}: is "):
-        load_state(tmp_path / CHECKPOINT)
+    with pytest.raises(InputError, match=rf"{RunFile.CHECKPOINT}: is "):
+        load_state(tmp_path / RunFile.CHECKPOINT)
 
 
 def test_file_without_the_state_of_a_system_is_rejected(tmp_path: Path) -> None:

@@ -202,7 +202,8 @@ def _minimise_compiled(T_wc: Tensor, *graph: Tensor, iterations: int, tolerance:
         return NotImplemented
     settings = float(limit), iterations, tolerance, _REGULARISATION, DAMPING_SCHEDULE
     rows = zip(*(to_rows(each, batch) for each in (T_wc, *columns)), strict=True)
-    return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*(*row, *settings)) for row in rows], batch))
+    problems = [(*row, *settings) for row in rows]
+    return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*problem) for problem in problems], batch))
 
 
 @compiled_by(_minimise_compiled)
@@ -239,8 +240,12 @@ def _prepare(
         information = torch.where(valid[..., None, None], information, identity)
     weights = fill_padding(weights, valid, 0.0)
     batch = common_batch(
-        *(T_wc.shape[:-3], edges.shape[:-2], T_ij.shape[:-3], information.shape[:-3]),
-        *(weights.shape[:-1], fixed.shape[:-1]),
+        T_wc.shape[:-3],
+        edges.shape[:-2],
+        T_ij.shape[:-3],
+        information.shape[:-3],
+        weights.shape[:-1],
+        fixed.shape[:-1],
     )
     graph = _Graph(
         edges=edges.expand(*batch, count, 2),
@@ -298,7 +303,13 @@ class PoseGraphOptimiser(torch.nn.Module):
     ) -> PoseGraphResult:
         """Optimise poses :math:`(*, N, 4, 4)` by E edges; see :func:`optimise_pose_graph`."""
         return optimise_pose_graph(
-            *(T_wc, edges, T_ij, information, fixed, weights, valid),
+            T_wc,
+            edges,
+            T_ij,
+            information=information,
+            fixed=fixed,
+            weights=weights,
+            valid=valid,
             iterations=self.iterations,
             tolerance=self.tolerance,
             robust=self.robust,

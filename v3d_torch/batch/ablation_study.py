@@ -29,6 +29,7 @@ from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import folder_name
 from v3d_torch.runs.console import run_with_progress
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.request import RunRequest
@@ -179,4 +180,4 @@ def _run(
         raise KeyboardInterrupt
     if pipeline.record.failure is not None:
         return {}, pipeline.record.failure
-    return json.loads((folder / "metrics.json").read_text(encoding="utf-8")), None
+    return json.loads((folder / RunFile.METRICS).read_text(encoding="utf-8")), None

@@ -11,12 +11,19 @@ from typing import Protocol
 
 from v3d_torch.batch.job import Job
 from v3d_torch.errors import OutputError
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import log_to
 
 _LOG = logging.getLogger(__name__)
 
 ONE_THREAD_ENVIRONMENT = dict.fromkeys(
-    (*("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "OPENCV_FOR_THREADS_NUM", "RAYON_NUM_THREADS"),
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "OPENCV_FOR_THREADS_NUM",
+        "RAYON_NUM_THREADS",
+    ),
     "1",
 )
 """Environment variables of a job that shares its machine with other jobs: libraries start no threads."""
@@ -74,7 +81,7 @@ def report_lost_process(job: Job, reason: str) -> JobFinished:
     Returns:
         The end of the job.
     """
-    with suppress(OutputError), log_to(job.folder / "run.log", append=True):
+    with suppress(OutputError), log_to(job.folder / RunFile.LOG, append=True):
         _LOG.error(reason)
     return JobFinished(job, reason)
 

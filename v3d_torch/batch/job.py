@@ -12,6 +12,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.runs.file_names import RunFile
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Job:
         if metrics.get("processed", 0) + metrics.get("skipped", 0) != self.frames:
             return None
         try:
-            config = load_config(self.folder / "config.yaml")
+            config = load_config(self.folder / RunFile.CONFIG)
         except ConfigError:
             config = None
         if config is None or single_threaded(config) != single_threaded(self.config):
@@ -86,7 +87,7 @@ class Job:
 
     def _read_metrics(self) -> Mapping[str, Any] | None:
         try:
-            metrics = json.loads((self.folder / "metrics.json").read_text(encoding="utf-8"))
+            metrics = json.loads((self.folder / RunFile.METRICS).read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError):
             return None
         return metrics if isinstance(metrics, dict) else None

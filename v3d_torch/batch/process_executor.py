@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 from v3d_torch.batch.executor import ONE_THREAD_ENVIRONMENT, JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import remove_link
 
 if TYPE_CHECKING:
@@ -129,7 +130,7 @@ def _process_main(job: Job, connection: Connection, environment: Mapping[str, st
     os.environ.clear()  # the fork server has the environment of its start
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems on which `_block_interrupts` has no effect
-    _redirect_output(job.folder / "run.log")
+    _redirect_output(job.folder / RunFile.LOG)
 
     def report_progress(frames: int) -> None:
         try:

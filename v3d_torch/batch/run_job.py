@@ -12,6 +12,7 @@ from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError, 
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import FrameCallback
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import log_to
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import clear_earlier_results, lock_results
@@ -47,7 +48,7 @@ def _run(job: Job, on_frame: FrameCallback) -> str | None:
     checkpoint = _matching_checkpoint(job)
     if checkpoint is None:
         clear_earlier_results(job.folder)
-    with log_to(job.folder / "run.log", append=checkpoint is not None):
+    with log_to(job.folder / RunFile.LOG, append=checkpoint is not None):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
             warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run

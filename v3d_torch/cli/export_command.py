@@ -23,6 +23,7 @@ from v3d_torch.io.files import check_empty_folder, emptied_on_failure
 from v3d_torch.io.ply import read_ply_points
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import RunRequest, read_request
@@ -144,7 +145,7 @@ _WRITERS = {"nerfstudio": _write_nerfstudio, "colmap": _write_colmap, "tum": _wr
 
 
 def _point_map(run: StoredRun) -> Path:
-    path = run.folder / "map.ply"
+    path = run.folder / RunFile.MAP
     if not path.is_file():
         raise InputError(f"{path}: is missing, because the run did not end; continue it with run --resume {run.folder}")
     return path

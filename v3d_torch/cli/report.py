@@ -10,6 +10,7 @@ import typer
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.cli.options import make_app
 from v3d_torch.io.paths import expand_user_paths
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runtime.imports import quick_imports
 
 app = make_app()
@@ -36,5 +37,5 @@ def main(
 
     with exit_on_error():
         run = read_run(folder, groundtruth)
-        write_text(folder / "report.html", render_page(run))
-        typer.echo(f"report: {printable(folder / 'report.html')}")
+        write_text(folder / RunFile.REPORT, render_page(run))
+        typer.echo(f"report: {printable(folder / RunFile.REPORT)}")

@@ -24,8 +24,9 @@ from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
-from v3d_torch.runs.checkpoint import CHECKPOINT, Checkpoint, describe_change, is_finished, read_checkpoint
+from v3d_torch.runs.checkpoint import Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
+from v3d_torch.runs.file_names import MASKS, RunFile
 from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
@@ -171,7 +172,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         segment.check_number(len(sequence))
     viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
-    if masks is not None and masks.resolve() == (folder / "masks").resolve():
+    if masks is not None and masks.resolve() == (folder / MASKS).resolve():
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if checkpoint is not None:
         total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
@@ -248,7 +249,7 @@ def _print_summary(
 
 def _way_to_resume(folder: Path) -> str:
     """Return the end of a message on a run that ended early: how to resume it; empty if it has no checkpoint."""
-    return f"; resume with --resume {folder}" if (folder / CHECKPOINT).is_file() else ""
+    return f"; resume with --resume {folder}" if (folder / RunFile.CHECKPOINT).is_file() else ""
 
 
 def _summary_table(

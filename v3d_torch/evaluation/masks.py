@@ -19,6 +19,14 @@ UNSURE = 255
 _MIN_OVERLAP = 0.5
 """Intersection over union above which an object covers a person, as for the id switches of MOTS."""
 
+MIN_FRACTION_IN_VIEW = 0.003
+"""Minimum fraction of the image that a person in view covers: 900 pixels at 640x480, about a tenth of a person at
+5 m. No detector finds smaller parts, such as a sleeve behind a door."""
+
+MAX_ABSENCE = 0.5
+"""Maximum time out of view after which the id must be the same, seconds. The score measures whether ids continue, not
+whether people are recognised: after a longer absence, the last position of a person does not show who returns."""
+
 
 @dataclass(frozen=True)
 class PersonScore:
@@ -75,15 +83,6 @@ class MaskEvaluation:
     was out of view for longer than `MAX_ABSENCE` can return with another id; this is not an id switch.
     """
 
-    MIN_FRACTION_IN_VIEW = 0.003
-    """Minimum fraction of the image that a person in view covers: 900 pixels at 640x480, about a tenth of a person at
-    5 m. No detector finds smaller parts, such as a sleeve behind a door."""
-
-    MAX_ABSENCE = 0.5
-    """Maximum time out of view after which the id must be the same, seconds. The score measures
-    whether ids continue, not whether people are recognised: after a longer absence, the last position of a person does
-    not show who returns."""
-
     def __init__(self) -> None:
         self._frames = 0
         self._moving, self._static, self._anywhere = torch.zeros(3, 2, dtype=torch.int64)
@@ -106,7 +105,7 @@ class MaskEvaluation:
         self._moving += tally(masked, ~static & (truth != UNSURE) & measured)
         self._static += tally(masked, static & measured)
         self._anywhere += tally(masked, static)
-        people = people_in_view(truth, measured, round(self.MIN_FRACTION_IN_VIEW * truth.numel()))
+        people = people_in_view(truth, measured, round(MIN_FRACTION_IN_VIEW * truth.numel()))
         for person, id_ in zip(people.tolist(), covering_ids(truth, people, objects).tolist(), strict=True):
             self._ids_in_view.setdefault(person, []).append((stamp, id_))
 
@@ -129,7 +128,7 @@ class MaskEvaluation:
     def _score(self, person: int) -> PersonScore:
         stamps, ids = zip(*self._ids_in_view[person], strict=True)
         object_ids = torch.tensor(ids)
-        switches = count_id_switches(torch.tensor(stamps, dtype=torch.float64), object_ids, self.MAX_ABSENCE)
+        switches = count_id_switches(torch.tensor(stamps, dtype=torch.float64), object_ids, MAX_ABSENCE)
         return PersonScore(person, in_view=len(ids), found=int((object_ids > 0).sum()), id_switches=switches)
 
 

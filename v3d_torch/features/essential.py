@@ -137,10 +137,17 @@ def _sample_eight_points(
     def squared_errors(E: Tensor) -> Tensor:
         return problem._replace(**by_hypothesis).sampson(E).square()
 
+    identity = torch.eye(3, dtype=a.dtype, device=a.device)
     return find_best_hypothesis(
-        *(solve, squared_errors, valid, torch.eye(3, dtype=a.dtype, device=a.device)),
-        size=8, threshold=threshold, iterations=iterations, seed=seed,
-    )  # fmt: skip
+        solve,
+        squared_errors,
+        valid,
+        identity,
+        size=8,
+        threshold=threshold,
+        iterations=iterations,
+        seed=seed,
+    )
 
 
 def _homogeneous(uv: Tensor) -> Tensor:

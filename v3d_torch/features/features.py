@@ -25,7 +25,8 @@ class Features:
         uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
         pixel: Nearest (column, row) in the recorded (distorted) image, int64, shape :math:`(N, 2)`.
         depth: Depth along z, metres, float64, shape :math:`(N,)`; 0 = no measurement.
-        octave: Level of the scale pyramid, int64, shape :math:`(N,)`.
+        octave: Octaves, int64, shape :math:`(N,)`. As for OpenCV's key points, it is a level of the scale pyramid,
+            whose step is ``features.scale``, not 2.
         descriptors: 256-bit descriptors, uint8, shape :math:`(N, 32)`.
         readout_jacobian: Derivative of ``uv`` by the readout time of a rolling shutter, pixels per second, float64,
             shape :math:`(N, 2)`; 0 if not given, as for a camera at rest.
@@ -126,12 +127,12 @@ def make_measurements(
     config: TrackingConfig,
     pyramid: FeaturesConfig,
 ) -> Measurements:
-    """Measurements and their noise; that of pixels is proportional to the pixel size of their pyramid level.
+    """Measurements and their noise; that of pixels is proportional to the pixel size of their octave.
 
     Args:
         uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
         inverse_depth: Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement.
-        octave: Level of the scale pyramid of each feature, int64, shape :math:`(N,)`.
+        octave: Octave of each feature, int64, shape :math:`(N,)`.
         sigma_ratio: See `Features`, float64, shape :math:`(N, 2)`.
         config: Configuration with the standard deviations of pixels at level 0 and of inverse depth.
         pyramid: Scale factor between pyramid levels.

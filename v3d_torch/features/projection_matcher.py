@@ -16,6 +16,13 @@ from v3d_torch.kernels import landmark_projection as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.optim.reprojection import MIN_DEPTH
 
+_MIN_COSINE = 0.5
+"""Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
+
+_LEVEL_MARGIN = 1.2
+"""Number of levels beyond either end of the pyramid at which landmarks are still matched: the expected level is
+rounded, and descriptors tolerate a difference of one level."""
+
 
 @dataclass(frozen=True)
 class LocalMap:
@@ -46,13 +53,13 @@ class ProjectedLandmarks:
         indices: Indices of the landmarks in the local map, int64, shape :math:`(V,)`.
         uv: Undistorted pixels, float64, shape :math:`(V, 2)`.
         depth: Depth along z, metres, float64, shape :math:`(V,)`.
-        levels: Expected levels of the scale pyramid, int64, shape :math:`(V,)`.
+        octave: Expected octaves, int64, shape :math:`(V,)`.
     """
 
     indices: Tensor
     uv: Tensor
     depth: Tensor
-    levels: Tensor
+    octave: Tensor
 
 
 def _project_compiled(self: ProjectionMatcher, T_cw: Tensor, local_map: LocalMap) -> ProjectedLandmarks:
@@ -73,22 +80,15 @@ class ProjectionMatcher:
         camera: Intrinsics.
     """
 
-    _MIN_COSINE = 0.5
-    """Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
-
-    _LEVEL_MARGIN = 1.2
-    """Number of levels beyond either end of the pyramid at which landmarks are still matched: the expected level is
-    rounded, and descriptors tolerate a difference of one level."""
-
     def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._scale = pyramid.scale
         self._levels = pyramid.levels
         self._camera = camera
         # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower bounds are inclusive.
-        margin = self._LEVEL_MARGIN
+        margin = _LEVEL_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
-        lower = [MIN_DEPTH, u_min, v_min, self._MIN_COSINE, -margin]
+        lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, -margin]
         upper = [math.inf, u_max, v_max, math.inf, pyramid.levels - 1 + margin]
         self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
 
@@ -109,8 +109,8 @@ class ProjectionMatcher:
         """
         pairs = match_by_projection(
             projection.uv,
-            radius * self._scale ** projection.levels.to(torch.float64),
-            projection.levels,
+            radius * self._scale ** projection.octave.to(torch.float64),
+            projection.octave,
             local_map.descriptors.index_select(0, projection.indices),
             features.uv,
             features.octave,
@@ -143,5 +143,5 @@ class ProjectionMatcher:
         lower, upper = self._bounds[..., None]
         rows = torch.nonzero(((predicted >= lower) & (predicted < upper)).all(dim=0))[:, 0]
         z, u, v, _, level = predicted.index_select(1, rows)
-        levels = level.round().clamp(0, self._levels - 1).to(torch.int64)
-        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, levels)
+        octave = level.round().clamp(0, self._levels - 1).to(torch.int64)
+        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, octave)

@@ -21,28 +21,28 @@ _MAX_DISTANCE = 1 << 9
 def _match_by_projection_compiled(
     projected: Tensor,
     radius: Tensor,
-    levels: Tensor,
-    descriptors: Tensor,
+    landmark_octave: Tensor,
+    landmark_descriptors: Tensor,
     uv: Tensor,
     octave: Tensor,
-    candidates: Tensor,
+    descriptors: Tensor,
     *,
     max_hamming: int,
     max_ratio: float,
 ) -> Tensor:
-    types = {projected.dtype, radius.dtype, uv.dtype}, {levels.dtype, octave.dtype}
-    if types != ({torch.float64}, {torch.int64}) or not are_descriptors(descriptors, candidates):
+    types = {projected.dtype, radius.dtype, uv.dtype}, {landmark_octave.dtype, octave.dtype}
+    if types != ({torch.float64}, {torch.int64}) or not are_descriptors(landmark_descriptors, descriptors):
         return NotImplemented
     if uv.shape[0] == 0:
         return torch.zeros(0, 2, dtype=torch.int64)
     pairs = projection_kernels.match_by_projection(
         to_array(projected),
         to_array(radius),
-        to_array(levels),
-        as_words(descriptors),
+        to_array(landmark_octave),
+        as_words(landmark_descriptors),
         to_array(uv),
         to_array(octave),
-        as_words(candidates),
+        as_words(descriptors),
         max_hamming,
         max_ratio,
         _CELL,
@@ -54,11 +54,11 @@ def _match_by_projection_compiled(
 def match_by_projection(
     projected: Tensor,
     radius: Tensor,
-    levels: Tensor,
-    descriptors: Tensor,
+    landmark_octave: Tensor,
+    landmark_descriptors: Tensor,
     uv: Tensor,
     octave: Tensor,
-    candidates: Tensor,
+    descriptors: Tensor,
     *,
     max_hamming: int,
     max_ratio: float,
@@ -68,11 +68,11 @@ def match_by_projection(
     Args:
         projected: Projection of each landmark, pixels, shape :math:`(L, 2)`.
         radius: Search radius around each projection, pixels, shape :math:`(L,)`.
-        levels: Expected pyramid level of each landmark, int64, shape :math:`(L,)`; a feature's level can differ by one.
-        descriptors: Descriptors of the landmarks, uint8, shape :math:`(L, 32)`.
+        landmark_octave: Expected octave of each landmark, int64, shape :math:`(L,)`; a feature's can differ by one.
+        landmark_descriptors: Descriptors of the landmarks, uint8, shape :math:`(L, 32)`.
         uv: Pixels of the features, shape :math:`(N, 2)`.
-        octave: Pyramid levels of the features, int64, shape :math:`(N,)`.
-        candidates: Descriptors of the features, uint8, shape :math:`(N, 32)`.
+        octave: Octaves of the features, int64, shape :math:`(N,)`.
+        descriptors: Descriptors of the features, uint8, shape :math:`(N, 32)`.
         max_hamming: Maximum Hamming distance, bits.
         max_ratio: Maximum ratio of the best to the second-best distance among the candidates of a landmark.
 
@@ -81,12 +81,12 @@ def match_by_projection(
         occurs at most once.
     """
     landmark, feature = _pairs_within(projected.T.contiguous().numpy(), radius.numpy(), uv.T.contiguous().numpy())
-    same_level = np.flatnonzero(np.abs(levels.numpy()[landmark] - octave.numpy()[feature]) <= 1)
-    landmark, feature = landmark[same_level], feature[same_level]
+    is_near_octave = np.flatnonzero(np.abs(landmark_octave.numpy()[landmark] - octave.numpy()[feature]) <= 1)
+    landmark, feature = landmark[is_near_octave], feature[is_near_octave]
     landmark_rows, feature_rows = (torch.from_numpy(rows) for rows in (landmark, feature))
     # index_select is faster than indexing here.
     distance = hamming_distance(
-        descriptors.index_select(0, landmark_rows), candidates.index_select(0, feature_rows)
+        landmark_descriptors.index_select(0, landmark_rows), descriptors.index_select(0, feature_rows)
     ).numpy()
 
     # Best and second-best candidate of each landmark.

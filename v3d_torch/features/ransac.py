@@ -150,7 +150,7 @@ def pnp_ransac(
 
 
 def _squared_errors(T_cw: Tensor, points: Tensor, uv: Tensor, K: Tensor) -> Tensor:
-    """Squared reprojection errors, pixels, (..., N); infinite for points behind the camera."""
+    """Squared reprojection errors, square pixels, (..., N); infinite for points behind the camera."""
     in_camera = points @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]
     xy = in_camera[..., :2] / in_camera[..., 2:].clamp(min=MIN_DEPTH)
     error = (xy * K.diagonal(dim1=-2, dim2=-1)[..., None, :2] + K[..., None, :2, 2] - uv).square().sum(dim=-1)
@@ -193,9 +193,15 @@ def _sample_torch(
 
     identity = torch.eye(4, dtype=points.dtype, device=points.device)
     return find_best_hypothesis(
-        *(solve, lambda T_cw: _squared_errors(T_cw, *by_hypothesis), valid, identity),
-        size=3, threshold=threshold, iterations=iterations, seed=seed,
-    )  # fmt: skip
+        solve,
+        lambda T_cw: _squared_errors(T_cw, *by_hypothesis),
+        valid,
+        identity,
+        size=3,
+        threshold=threshold,
+        iterations=iterations,
+        seed=seed,
+    )
 
 
 class PnPRANSAC(torch.nn.Module):
@@ -223,7 +229,11 @@ class PnPRANSAC(torch.nn.Module):
     ) -> PnP:
         """Estimate poses from points :math:`(*, N, 3)` at pixels :math:`(*, N, 2)`; see :func:`pnp_ransac`."""
         return pnp_ransac(
-            *(points, uv, K, initial_guess, valid),
+            points,
+            uv,
+            K,
+            initial_guess=initial_guess,
+            valid=valid,
             threshold=self.threshold,
             iterations=self.iterations,
             seed=self.seed,

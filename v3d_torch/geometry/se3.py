@@ -2,8 +2,7 @@
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
 All functions are batched over leading dimensions, differentiable, and meant for float64; half precision is computed in
-float32. Their results equal those of
-PyPose, but they use plain matrices, which is faster for single poses.
+float32. Their results equal those of PyPose, but they use plain matrices, which is faster for single poses.
 
 Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018.
 """

@@ -21,8 +21,11 @@ _MAX_HEADER_BYTES = 1 << 20
 """Maximum size of the extension header of a member, bytes: tarfile reads it as a whole, and it contains only a name."""
 
 _EXTENSION_HEADERS = (
-    *(tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK),
-    *(tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE),
+    tarfile.GNUTYPE_LONGNAME,
+    tarfile.GNUTYPE_LONGLINK,
+    tarfile.XHDTYPE,
+    tarfile.XGLTYPE,
+    tarfile.SOLARIS_XHDTYPE,
 )
 """Types of extension headers: long names, and PAX records."""
 

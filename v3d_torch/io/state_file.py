@@ -32,8 +32,14 @@ _PLACEHOLDER_DIGEST = "0" * hashlib.sha256().digest_size * 2
 _BLOCK_SIZE = 1 << 20
 
 _DAMAGE_ERRORS = (
-    *(UnpicklingError, RuntimeError, EOFError, ValueError),
-    *(LookupError, TypeError, AttributeError, MemoryError),
+    UnpicklingError,
+    RuntimeError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    MemoryError,
 )
 """Exceptions that a damaged archive, or damaged objects in it, can raise while loading."""
 

@@ -32,7 +32,7 @@ def project(
         levels: Number of pyramid levels.
 
     Returns:
-        Indices of the landmarks in view, (V,), their pixels, (V, 2), depth, metres, (V,), and pyramid levels, (V,).
+        Indices of the landmarks in view, (V,), their pixels, (V, 2), depth, metres, (V,), and octaves, (V,).
     """
     lower, upper = bounds
     rows, level_of = np.empty(len(points), np.int64), np.empty(len(points), np.int64)

@@ -30,19 +30,19 @@ def _sort_by_cell(column: Indices, row: Indices, width: int, height: int) -> tup
 
 @kernel("(f8[:,::1], f8[::1], i8[::1], u8[:,::1], f8[:,::1], i8[::1], u8[:,::1], i8, f8, f8)")
 def match_by_projection(
-    projected: Array, radius: Array, levels: Indices, descriptors: Words, uv: Array, octave: Indices, candidates: Words,
-    max_hamming: int, max_ratio: float, cell: float,
+    projected: Array, radius: Array, landmark_octave: Indices, landmark_descriptors: Words, uv: Array, octave: Indices,
+    descriptors: Words, max_hamming: int, max_ratio: float, cell: float,
 ) -> Indices:  # fmt: skip
     """Pairs (landmark, feature) with similar descriptors near the landmark's projection, sorted by landmark, (K, 2).
 
     Args:
         projected: Projection of each landmark, pixels, (L, 2).
         radius: Search radius around each projection, pixels, (L,).
-        levels: Expected pyramid level of each landmark, (L,).
-        descriptors: Descriptors of the landmarks, (L, 4).
+        landmark_octave: Expected octave of each landmark, (L,).
+        landmark_descriptors: Descriptors of the landmarks, (L, 4).
         uv: Pixels of the features, at least one, (N, 2).
-        octave: Pyramid levels of the features, (N,).
-        candidates: Descriptors of the features, (N, 4).
+        octave: Octaves of the features, (N,).
+        descriptors: Descriptors of the features, (N, 4).
         max_hamming: Maximum Hamming distance, bits.
         max_ratio: Maximum ratio of the best to the second-best distance.
         cell: Side of the cells of the search grid, pixels.
@@ -64,9 +64,9 @@ def match_by_projection(
             for position in range(begin[y * width + left], begin[y * width + right + 1]):
                 i = order[position]
                 du, dv = uv[i, 0] - projected[k, 0], uv[i, 1] - projected[k, 1]
-                if not du * du + dv * dv <= r * r or abs(levels[k] - octave[i]) > 1:
+                if not du * du + dv * dv <= r * r or abs(landmark_octave[k] - octave[i]) > 1:
                     continue
-                distance = hamming_distance(descriptors, k, candidates, i)
+                distance = hamming_distance(landmark_descriptors, k, descriptors, i)
                 if distance < best:
                     if nearest >= 0:
                         second = best

@@ -195,7 +195,7 @@ def _minimise_compiled(
     problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
     results = []
     for T, X, (order, problem) in zip(to_rows(T_cw, batch), to_rows(points, batch), problems, strict=True):
-        *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(*(T, X, *problem, *settings))
+        *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(T, X, *problem, *settings)
         chi2 = np.empty_like(squared)
         chi2[order] = squared
         results.append((*moved, chi2, cost_before, cost_after, steps))
@@ -266,5 +266,5 @@ class BundleAdjuster(torch.nn.Module):
         """
         observed = uv, pose, point, K, inverse_depth, self.pixel_sigma, self.inverse_depth_sigma
         return bundle_adjust(
-            *(T_cw, points, *observed, fixed, weights, valid), iterations=self.iterations, tolerance=self.tolerance
+            T_cw, points, *observed, fixed, weights, valid, iterations=self.iterations, tolerance=self.tolerance
         )

@@ -228,8 +228,13 @@ def prepare_bundle(
     if weights is None:
         weights = torch.ones(pose.shape, dtype=torch.float64, device=uv.device)
     batch = common_batch(
-        *(T_cw.shape[:-3], points.shape[:-2], target.scale.shape[:-2], pose.shape[:-1], point.shape[:-1]),
-        *(fixed.shape[:-1], weights.shape[:-1]),
+        T_cw.shape[:-3],
+        points.shape[:-2],
+        target.scale.shape[:-2],
+        pose.shape[:-1],
+        point.shape[:-1],
+        fixed.shape[:-1],
+        weights.shape[:-1],
     )
     each = (*batch, pose.shape[-1])  # observation
     problem = BundleProblem(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.membership import contains
 
 
 def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
@@ -22,9 +23,8 @@ def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
     """
     # NumPy is faster here than torch, and indices are faster than a mask.
     keyframe, landmark, valid = (tables.observations[name].numpy() for name in ("keyframe", "landmark", "valid"))
-    wanted = np.zeros(len(tables.landmarks), dtype=np.bool_)
-    wanted[landmarks.numpy()] = True
-    observers = keyframe[np.flatnonzero(wanted[landmark] & valid)]
+    is_wanted = contains(landmarks.numpy(), landmark, len(tables.landmarks))
+    observers = keyframe[np.flatnonzero(is_wanted & valid)]
     return torch.from_numpy(np.bincount(observers, minlength=len(tables.keyframes)))
 
 
@@ -56,9 +56,8 @@ def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
         IDs, ascending, int64, shape :math:`(L,)`.
     """
     keyframe, landmark = (tables.observations[name].numpy() for name in ("keyframe", "landmark"))
-    wanted, observed = np.zeros(len(tables.keyframes), np.bool_), np.zeros(len(tables.landmarks), np.bool_)
-    wanted[keyframes.numpy()] = True
-    observed[landmark[np.flatnonzero(wanted[keyframe])]] = True
+    observed = np.zeros(len(tables.landmarks), np.bool_)
+    observed[landmark[np.flatnonzero(contains(keyframes.numpy(), keyframe, len(tables.keyframes)))]] = True
     return torch.from_numpy(np.flatnonzero(observed))
 
 

@@ -16,6 +16,7 @@ from v3d_torch.config import MappingConfig
 from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.membership import contains
 
 _MIN_FOUND_RATIO = 0.25
 """Minimum ratio of frames that matched a landmark to frames that should have matched it (ORB-SLAM2)."""
@@ -100,8 +101,8 @@ class _Neighbourhood:
         keyframe, landmark, octave, valid = (tables.observations[name].numpy() for name in names)
         self._keyframe_count, self._landmark_count = len(tables.keyframes), len(tables.landmarks)
         usable = valid & tables.landmarks["active"].numpy()[landmark]
-        by_keyframes = usable & _contains(keyframes, keyframe, self._keyframe_count)
-        rows = usable & _contains(landmark[by_keyframes], landmark, self._landmark_count)
+        by_keyframes = usable & contains(np.array(keyframes, np.int64), keyframe, self._keyframe_count)
+        rows = usable & contains(landmark[by_keyframes], landmark, self._landmark_count)
         self._keyframe, self._octave, self._landmark = keyframe[rows], octave[rows], landmark[rows]
         self._levels = int(self._octave.max()) + 1 if len(self._octave) else 1
 
@@ -117,7 +118,7 @@ class _Neighbourhood:
     def most_covisible(self, keyframe: int) -> int:
         """Return the other keyframe that shares most landmarks with the given one; the newest of several."""
         own = self._landmark[self._keyframe == keyframe]
-        shared = np.bincount(self._keyframe[_contains(own, self._landmark, self._landmark_count)])
+        shared = np.bincount(self._keyframe[contains(own, self._landmark, self._landmark_count)])
         shared[keyframe] = 0
         return int((shared * len(shared) + np.arange(len(shared))).argmax())
 
@@ -129,10 +130,3 @@ class _Neighbourhood:
             self._octave[others],
             self._landmark[others],
         )
-
-
-def _contains(ids: NDArray[np.int64] | list[int], queries: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    """Check which integers in [0, count) are in a set."""
-    table = np.zeros(count, dtype=np.bool_)
-    table[ids] = True
-    return table[queries]

@@ -47,7 +47,7 @@ class Keyframe:
         return self.reference != self.index
 
     @property
-    def disconnected(self) -> bool:
+    def is_disconnected(self) -> bool:
         """True if the pose of the keyframe relative to the start of the map is only a guess."""
         return self.part != 0
 

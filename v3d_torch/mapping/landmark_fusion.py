@@ -16,7 +16,7 @@ from v3d_torch.features.projection_matcher import ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
-from v3d_torch.mapping.landmark_ids import contains
+from v3d_torch.mapping.membership import contains
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.optim.reprojection import chi_square, reprojection_residuals
 
@@ -58,8 +58,8 @@ class LandmarkFusion:
     def _fuse(self, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe) -> None:
         """Match landmarks to features of a keyframe by projection, and fuse the matches."""
         features, config = keyframe.features, self._config
-        observed = contains(keyframe.observed_landmarks, landmarks, len(sparse_map.landmarks))
-        local = sparse_map.select_landmarks(landmarks[~observed].sort().values)
+        observed = contains(keyframe.observed_landmarks.numpy(), landmarks.numpy(), len(sparse_map.landmarks))
+        local = sparse_map.select_landmarks(landmarks[~torch.from_numpy(observed)].sort().values)
         projected = self._match.project(keyframe.T_cw, local)
         row, feature = self._match(features, projected, local, _SEARCH_RADIUS).unbind(dim=1)
         # Reject matches by reprojection error, depth included.

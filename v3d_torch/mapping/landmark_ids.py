@@ -1,4 +1,4 @@
-"""Landmark IDs: membership, merging of duplicate landmarks, and compaction of the landmark table."""
+"""Landmark IDs: merging of duplicate landmarks, and compaction of the landmark table."""
 
 from __future__ import annotations
 
@@ -13,21 +13,6 @@ from v3d_torch.mapping.map_tables import MapTables
 _MAX_LANDMARKS_PER_OBSERVATION = 2
 """Ratio of landmarks to observations above which the table is compacted. Every active landmark has at least one
 observation, so above this ratio more than half of the landmarks are inactive."""
-
-
-def contains(ids: Tensor, queries: Tensor, count: int) -> Tensor:
-    """Check which landmark IDs are in a set, by a lookup table because `torch.isin` sorts.
-
-    Args:
-        ids: IDs in the set, without -1, int64, shape :math:`(L,)`.
-        queries: IDs to check, -1 for none, int64, shape :math:`(N,)`.
-        count: Number of landmarks in the map.
-
-    Returns:
-        True for queries in the set, false for -1, bool, shape :math:`(N,)`.
-    """
-    table = torch.zeros(count + 1, dtype=torch.bool)  # index -1 is the last entry
-    return table.index_fill_(0, ids, True)[queries]
 
 
 def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:

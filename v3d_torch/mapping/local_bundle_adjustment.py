@@ -98,7 +98,12 @@ def local_bundle_adjust(
     if _is_calibration_due(sparse_map, keyframe, config.rolling_shutter):
         readout_jacobian = sparse_map.observations["readout_jacobian"].index_select(0, selected.rows)
         estimate = estimate_readout(
-            *(readout.seconds, readout.information, readout_jacobian, result.T_cw, result.points), **observations
+            readout.seconds,
+            readout.information,
+            readout_jacobian,
+            result.T_cw,
+            result.points,
+            **observations,
         )
         readout = Readout(*map(float, estimate))
     T_cw[poses[~fixed]] = orthonormalise(result.T_cw[~fixed])

@@ -12,6 +12,7 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.features.features import make_measurements
 from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.membership import contains
 from v3d_torch.optim.reprojection import Measurements
 
 
@@ -61,13 +62,11 @@ def select_observations(tables: MapTables, window: Tensor, config: Config, *, wi
     table, count = tables.observations, len(tables.landmarks)
     keyframe, landmark, valid = (table[name].numpy() for name in ("keyframe", "landmark", "valid"))
     usable = valid & tables.landmarks["active"].numpy().take(landmark)
-    in_window, observed = np.zeros(len(tables.keyframes), np.bool_), np.zeros(count, np.bool_)
-    in_window[window.numpy()] = True
-    by_window = usable & in_window.take(keyframe)
-    observed[landmark[by_window]] = True
+    by_window = usable & contains(window.numpy(), keyframe, len(tables.keyframes))
+    is_observed = contains(landmark[by_window], landmark, count)
     usable = usable if with_neighbours else by_window
     times = np.bincount(landmark[usable], minlength=count)
-    rows = torch.from_numpy(np.flatnonzero(usable & (observed & (times > 1)).take(landmark)))
+    rows = torch.from_numpy(np.flatnonzero(usable & is_observed & (times > 1).take(landmark)))
     keyframes, pose = unique_ids(table["keyframe"][rows], len(tables.keyframes))
     landmarks, point = unique_ids(table["landmark"][rows], count)
     names = ("uv", "inverse_depth", "octave", "sigma_ratio")

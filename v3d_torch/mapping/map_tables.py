@@ -39,7 +39,7 @@ class MapTables:
             - ``uv``: Undistorted pixel, float64, :math:`(2,)`.
             - ``readout_jacobian``: Derivative of ``uv`` with respect to the readout, pixels/s, float64, :math:`(2,)`.
             - ``inverse_depth``: 1/m, float64; 0 without a depth measurement.
-            - ``octave``: Pyramid level, int64.
+            - ``octave``: Octave, see `Features`, int64.
             - ``sigma_ratio``: Relative standard deviations of pixel and inverse depth, see `Features`, float64,
               :math:`(2,)`.
             - ``valid``: False once the observation is removed as an outlier, bool.

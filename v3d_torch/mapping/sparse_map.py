@@ -18,6 +18,7 @@ from v3d_torch.mapping.covisibility import covisible_keyframes, observed_landmar
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_creation import create_landmarks, landmark_points, select_new_landmarks
 from v3d_torch.mapping.map_tables import MapTables
+from v3d_torch.mapping.membership import contains
 from v3d_torch.odometry.rolling_shutter import Readout
 
 
@@ -195,8 +196,8 @@ class SparseMap(MapTables):
             keyframe: Keyframe whose features were matched.
             landmarks: ID of the matched landmark of each feature, -1 for none, int64, shape :math:`(N,)`.
         """
-        observed = landmark_ids.contains(keyframe.observed_landmarks, landmarks, len(self.landmarks))
-        matched = (landmarks >= 0) & ~observed
+        observed = contains(keyframe.observed_landmarks.numpy(), landmarks.numpy(), len(self.landmarks))
+        matched = (landmarks >= 0) & ~torch.from_numpy(observed)
         duplicate = matched & (keyframe.landmarks >= 0)
         self._add_observations(keyframe, torch.nonzero(matched & ~duplicate)[:, 0], landmarks)
         own, other = keyframe.landmarks[duplicate], landmarks[duplicate]

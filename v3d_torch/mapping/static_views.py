@@ -99,7 +99,7 @@ class StaticViews:
     def connected(self) -> StaticViews:
         """Return these views without those of disconnected keyframes, whose place in the map is only a guess."""
         views = copy(self)
-        views._views = [view for view in self if not view.keyframe.disconnected]
+        views._views = [view for view in self if not view.keyframe.is_disconnected]
         return views
 
     def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor, depth_delay: float = 0.0) -> None:

@@ -56,8 +56,7 @@ def observe_voxels(
     sample is hit, even if other rays pass through it.
 
     Args:
-        depth: Depth of samples, metres, float32, shape :math:`(h, w)`; 0, NaN or infinite = no
-            measurement.
+        depth: Depth of samples, metres, float32, shape :math:`(h, w)`; 0, NaN or infinite = no measurement.
         static: Mask of samples on static surfaces, bool, shape :math:`(h, w)`. Other samples hit no voxel; they only
             show that the space in front of them is free.
         rays: Viewing ray of each sample at unit depth, float32, shape :math:`(h, w, 3)`.

@@ -21,7 +21,7 @@ from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
-from v3d_torch.optim.levenberg_marquardt import OptimisationResult, levenberg_marquardt
+from v3d_torch.optim.levenberg_marquardt import POSE_TOLERANCE, OptimisationResult, levenberg_marquardt
 from v3d_torch.runtime.batches import common_batch
 
 _COARSE_INVERSE_DEPTH_SIGMA = 0.02
@@ -34,8 +34,12 @@ _MIN_INLIER_RATIO = 0.75
 _MIN_CORRELATION = 0.9
 """Minimum correlation of the brightness of both views. Unlike a residual, it does not depend on exposure."""
 
-_TOLERANCE = 1e-3
-"""Relative change of the cost at convergence. Convergence is quadratic, so the next step would change far less."""
+_MIN_CONTRAST = 2e-3
+"""Minimum standard deviation of brightness on the coarsest level: half an 8-bit step."""
+
+_MAX_DEPTH_SIGMAS = 5.0
+"""Maximum difference at which depths agree, in standard deviations of inverse depth. It is large because the delay
+between colour and depth, and depth edges, make the residuals heavy-tailed."""
 
 
 class DenseAlignment(NamedTuple):
@@ -124,13 +128,6 @@ class DenseAligner(torch.nn.Module):
         camera: Camera of both views, with lens distortion. Levels with fewer than 2 rows or columns are skipped.
     """
 
-    _MIN_CONTRAST = 2e-3
-    """Minimum standard deviation of brightness on the coarsest level: half an 8-bit step."""
-
-    _MAX_DEPTH_SIGMAS = 5.0
-    """Maximum difference at which depths agree, in standard deviations of inverse depth. It is large because the delay
-    between colour and depth, and depth edges, make the residuals heavy-tailed."""
-
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
         super().__init__()
         size = min(camera.width, camera.height)
@@ -178,9 +175,8 @@ class DenseAligner(torch.nn.Module):
             self._align(self.view(grey_a, depth_a, static_a), self.view(grey_b, depth_b, static_b), T_ba)
             for grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b in zip(*columns, strict=True)
         ]
-        failed = _failed_alignment(
-            grey_a.device
-        )  # starts with an extra element, dropped below, so that an empty batch can be stacked
+        # The rows start with an extra element, dropped below, so that an empty batch can be stacked.
+        failed = _failed_alignment(grey_a.device)
         rows = [failed, *(failed if alignment is None else alignment for alignment in alignments)]
         stacked = (torch.stack(list(column))[1:] for column in zip(*rows, strict=True))
         return DenseAlignment(*(column.reshape((*batch, *column.shape[1:])) for column in stacked))
@@ -210,7 +206,9 @@ class DenseAligner(torch.nn.Module):
         for halvings in self._halvings:
             sigma = self._config.inverse_depth_sigma if halvings == finest else _COARSE_INVERSE_DEPTH_SIGMA
             problem = AlignmentProblem(a.levels[halvings], b.levels[halvings], state, sigma, self._config)
-            result = levenberg_marquardt(state, problem.linearise, step, self._config.iterations, tolerance=_TOLERANCE)
+            result = levenberg_marquardt(
+                state, problem.linearise, step, self._config.iterations, tolerance=POSE_TOLERANCE
+            )
             state = result.state
         return self._summarise(problem, result)
 
@@ -221,7 +219,7 @@ class DenseAligner(torch.nn.Module):
         greys = [grey[grey.isfinite()].to(torch.float64) for grey in greys]
         mean_a, mean_b = (grey.mean() for grey in greys)
         contrast_a, contrast_b = ((grey - grey.mean()).square().mean().sqrt() for grey in greys)
-        if not min(contrast_a, contrast_b) > self._MIN_CONTRAST:  # also true for NaN, if no pixel is static
+        if not min(contrast_a, contrast_b) > _MIN_CONTRAST:  # also true for NaN, if no pixel is static
             return None
         gain = contrast_b / contrast_a
         return torch.stack([gain, mean_b - gain * mean_a])
@@ -230,9 +228,7 @@ class DenseAligner(torch.nn.Module):
         T_ba, (gain, _) = orthonormalise(result.state[0]), result.state[1]
         residuals, config = problem.residuals(result.state), self._config
         (brightness, inverse_depth), valid_brightness = problem.reference.values.to(torch.float64), residuals.valid[0]
-        inliers = residuals.valid[1] & (
-            residuals.values[1].abs() <= self._MAX_DEPTH_SIGMAS * config.inverse_depth_sigma
-        )
+        inliers = residuals.valid[1] & (residuals.values[1].abs() <= _MAX_DEPTH_SIGMAS * config.inverse_depth_sigma)
         rms = [r[v].square().mean().sqrt() for r, v in zip(residuals.values, residuals.valid, strict=True)]
         information = problem.information(result.system, valid_brightness)
         scale = torch.ones_like(information[0])

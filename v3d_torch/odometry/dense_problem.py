@@ -28,6 +28,21 @@ _OCCLUSION_RATIO = 0.1
 """Maximum relative difference between the inverse depth in the current view and the expected one. Beyond it a point is
 occluded: the views show different surfaces, and their difference contains no information on the motion."""
 
+_MIN_RESIDUALS = 50
+"""Minimum number of valid residuals; with fewer, noise dominates the eight unknowns."""
+
+_MIN_BRIGHTNESS_SIGMA = 1e-3
+"""Minimum standard deviation of brightness: a quarter of an 8-bit step."""
+
+_MIN_DEPTH = 0.1
+"""Smallest depth of a point that is compared, metres, below the range of any RGB-D camera. It keeps 1/z
+finite, as the smaller `v3d_torch.optim.reprojection.MIN_DEPTH` does; no camera measures depth between the two."""
+
+_GRADIENT_NOISE = 0.3
+"""Variance of the noise of brightness gradients, divided by the squared scale of the residuals. The Sobel gradient
+has 12/64 of a pixel's variance; the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its
+variance."""
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -57,20 +72,6 @@ class AlignmentProblem:
         config: Degrees of freedom of the t-distribution.
     """
 
-    _MIN_RESIDUALS = 50
-    """Minimum number of valid residuals; with fewer, noise dominates the eight unknowns."""
-
-    _MIN_BRIGHTNESS_SIGMA = 1e-3
-    """Minimum standard deviation of brightness: a quarter of an 8-bit step."""
-
-    _MIN_DEPTH = 0.1
-    """Smallest depth of a point, metres, below the range of any RGB-D camera; keeps 1/z finite."""
-
-    _GRADIENT_NOISE = 0.3
-    """Variance of the noise of brightness gradients, divided by the squared scale of the residuals. The Sobel gradient
-    has 12/64 of a pixel's variance; the squared scale of a t-distribution with 5 degrees of freedom is 3/5 of its
-    variance."""
-
     def __init__(
         self,
         reference: Level,
@@ -82,7 +83,7 @@ class AlignmentProblem:
         self.reference, self._current = reference.reference_points, current
         self._degrees_of_freedom = config.degrees_of_freedom
         initial = self.residuals(initial_state)
-        self._sigma = initial.values.new_tensor([[self._MIN_BRIGHTNESS_SIGMA], [inverse_depth_sigma]])
+        self._sigma = initial.values.new_tensor([[_MIN_BRIGHTNESS_SIGMA], [inverse_depth_sigma]])
         for sigma, values, valid in zip(self._sigma, initial.values, initial.valid, strict=True):
             if valid.any():
                 sigma.clamp_(min=student_t_scale(values[valid].square(), config.degrees_of_freedom))
@@ -99,7 +100,7 @@ class AlignmentProblem:
         T_ba, (gain, bias) = state[0].to(torch.float32), state[1].to(torch.float32)
         camera = self._current.level_camera.camera
         points = self.reference.points @ T_ba[:3, :3].T + T_ba[:3, 3]
-        in_front = points[:, 2] > self._MIN_DEPTH
+        in_front = points[:, 2] > _MIN_DEPTH
         pixels = camera.distort(camera.project(points.where(in_front[:, None], 1.0))).to(torch.float32)
         last = torch.tensor([camera.width - 1, camera.height - 1], device=pixels.device)
         in_image = in_front & ((pixels >= 0) & (pixels <= last)).all(dim=1)
@@ -120,7 +121,7 @@ class AlignmentProblem:
     def linearise(self, state: State) -> tuple[Tensor, System]:
         """Mean robust cost, infinite with too few valid residuals, and normal equations."""
         residuals = self.residuals(state)
-        if int(residuals.valid.sum()) < self._MIN_RESIDUALS:
+        if int(residuals.valid.sum()) < _MIN_RESIDUALS:
             none = residuals.values.new_zeros(8, 8)
             return none.new_tensor(torch.inf), (none, none[0])
         costs, weights = student_t((residuals.values / self._sigma).square(), self._degrees_of_freedom)
@@ -144,7 +145,7 @@ class AlignmentProblem:
         H, _ = system
         pixel_jacobian = self.reference.pixel_jacobian[valid_brightness].flatten(0, 1).to(torch.float64)
         marginalised = H[:6, 6:] @ torch.linalg.pinv(H[6:, 6:], hermitian=True) @ H[6:, :6]
-        return H[:6, :6] - marginalised - self._GRADIENT_NOISE * sum_products(pixel_jacobian, pixel_jacobian)
+        return H[:6, :6] - marginalised - _GRADIENT_NOISE * sum_products(pixel_jacobian, pixel_jacobian)
 
 
 def step(state: State, system: System, damping: Tensor) -> State:

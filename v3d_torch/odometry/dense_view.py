@@ -112,9 +112,8 @@ class Level:
         points = self.level_camera.camera.rays.flatten(0, 1).to(index.device)[index] / values[1, :, None]
         one = torch.ones_like(values[1])
         unit = Measurements(uv=one[:, None].expand(-1, 2), inverse_depth=one, pixel_sigma=one, inverse_depth_sigma=1.0)
-        point_jacobian = reprojection_jacobian(
-            points, unit, self.level_camera.camera.K.to(points)
-        )  # of (u, v, 1/z), M x 3 x 6
+        # Derivatives of (u, v, 1/z), M x 3 x 6.
+        point_jacobian = reprojection_jacobian(points, unit, self.level_camera.camera.K.to(points))
         pixel_jacobian = (
             self.level_camera.distortion_jacobian.flatten(0, 1).to(index.device)[index] @ point_jacobian[:, :2]
         )

@@ -192,7 +192,12 @@ def compensate_features(features: Features, velocity: Tensor, readout: Readout, 
         The features with ``uv`` and ``readout_jacobian`` for this velocity.
     """
     uv, readout_jacobian = compensate_rolling_shutter(
-        *(features.uv, features.pixel[:, 1], features.inverse_depth, velocity, readout.seconds, camera.K),
+        features.uv,
+        features.pixel[:, 1],
+        features.inverse_depth,
+        velocity,
+        readout.seconds,
+        camera.K,
         camera.height,
         features.readout_jacobian,
     )

@@ -27,6 +27,10 @@ _DAMPING_FACTOR = 10
 DAMPING_SCHEDULE = (_INITIAL_DAMPING, _MIN_DAMPING, _MAX_DAMPING, float(_DAMPING_FACTOR))
 """The constants above, as arguments of kernels."""
 
+POSE_TOLERANCE = 1e-3
+"""Relative change of the cost at convergence if one pose is estimated. Convergence is quadratic, so the next step would
+change far less."""
+
 _SCALE_ITERATIONS = 10
 """Fixed-point iterations for the scale of a t-distribution; each one reduces the error by a constant factor."""
 

@@ -20,7 +20,7 @@ from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
-from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt, select
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, POSE_TOLERANCE, huber, levenberg_marquardt, select
 from v3d_torch.optim.reprojection import (
     INVERSE_DEPTH_SIGMA,
     MIN_DEPTH,
@@ -31,9 +31,6 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
-
-_TOLERANCE = 1e-3
-"""Relative change of the cost at convergence. Convergence is quadratic, so the next step would change far less."""
 
 _REGULARISATION = 1e-9
 """Number added to the diagonal of the normal equations, which are singular without measurements."""
@@ -138,7 +135,7 @@ def refine_pose(
     *,
     rounds: int = 4,
     iterations: int = 5,
-    tolerance: float = _TOLERANCE,
+    tolerance: float = POSE_TOLERANCE,
 ) -> PoseRefinement:
     r"""Refine predicted poses, and classify the measurements into inliers and outliers.
 
@@ -295,7 +292,7 @@ class PoseRefiner(torch.nn.Module):
         *,
         rounds: int = 4,
         iterations: int = 5,
-        tolerance: float = _TOLERANCE,
+        tolerance: float = POSE_TOLERANCE,
     ) -> None:
         super().__init__()
         self.pixel_sigma = pixel_sigma
@@ -319,7 +316,15 @@ class PoseRefiner(torch.nn.Module):
         See :func:`refine_pose`.
         """
         return refine_pose(
-            *(T_cw, points, uv, K, inverse_depth, self.pixel_sigma, self.inverse_depth_sigma, weights, valid),
+            T_cw,
+            points,
+            uv,
+            K,
+            inverse_depth,
+            pixel_sigma=self.pixel_sigma,
+            inverse_depth_sigma=self.inverse_depth_sigma,
+            weights=weights,
+            valid=valid,
             rounds=self.rounds,
             iterations=self.iterations,
             tolerance=self.tolerance,

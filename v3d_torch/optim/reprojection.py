@@ -176,13 +176,13 @@ def perspective_jacobian(projected: Tensor) -> Tensor:
     a, b, w = projected.unbind(dim=-2)  # (x/z, y/z, 1/z)
     o = torch.zeros_like(w)
     rows = (
-        *(w, o, o),
-        *(o, w, o),
-        *(-w * a, -w * b, -w * w),
-        *(-b * a, -b * b - 1, -b * w),
-        *(a * a + 1, a * b, a * w),
-        *(-b, a, o),
-    )
+        w, o, o,
+        o, w, o,
+        -w * a, -w * b, -w * w,
+        -b * a, -b * b - 1, -b * w,
+        a * a + 1, a * b, a * w,
+        -b, a, o,
+    )  # fmt: skip
     return torch.stack(rows, dim=-2).unflatten(-2, (6, 3))
 
 

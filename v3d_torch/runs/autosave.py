@@ -12,7 +12,8 @@ from pathlib import Path
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.errors import OutputError
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.runs.checkpoint import CHECKPOINT, FileSizes, write_checkpoint
+from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
 
 _LOG = logging.getLogger(__name__)
@@ -81,7 +82,7 @@ class Autosave:
     def discard(self) -> None:
         """Remove the checkpoint if the run reached the end of the sequence."""
         if self._pipeline.record.failure is None:
-            (self._folder / CHECKPOINT).unlink(missing_ok=True)
+            (self._folder / RunFile.CHECKPOINT).unlink(missing_ok=True)
 
     def _save(self, write: Callable[[], None], start: float) -> None:
         """Write results and checkpoint, and set the time of the next ones."""
@@ -97,7 +98,7 @@ class Autosave:
         self._pipeline.record.save_error = None  # before the record is stored in the checkpoint
         if self._request is None:
             return
-        start, path = time.perf_counter(), self._folder / CHECKPOINT
+        start, path = time.perf_counter(), self._folder / RunFile.CHECKPOINT
         write_checkpoint(self._folder, self._pipeline, self._request, self._sizes)
         seconds, size = time.perf_counter() - start, path.stat().st_size / 1e6
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)

@@ -24,32 +24,28 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedOb
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.repeated_images import RepeatedImages
 from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable, RunRecord, Snapshot, StateTable
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics, suggest_folder
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.state import STATE_CLASSES
 
-CHECKPOINT = "checkpoint.v3d"
-"""Name of the checkpoint file. It exists from the first checkpoint of a run to its end."""
-
 _CLASSES = (
     *STATE_CLASSES,
-    *(
-        RunRecord,
-        BrokenFrame,
-        FrameTimes,
-        LiveTable,
-        RepeatedImages,
-        ObjectTable,
-        StateTable,
-        Snapshot,
-        FrameObjects,
-        FrameResult,
-        TrackedObject,
-        MotionState,
-        MaskEvaluation,
-        StaticView,
-        set,
-    ),
+    RunRecord,
+    BrokenFrame,
+    FrameTimes,
+    LiveTable,
+    RepeatedImages,
+    ObjectTable,
+    StateTable,
+    Snapshot,
+    FrameObjects,
+    FrameResult,
+    TrackedObject,
+    MotionState,
+    MaskEvaluation,
+    StaticView,
+    set,
 )
 """Classes that a checkpoint can contain."""
 
@@ -121,7 +117,7 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest, size
         done = int(pipeline.record.times.indices[-1]) + 1
         metadata |= {"sequence": _fingerprint(sequence, done, sizes), "frames": len(pipeline.slam.poses)}
         state = pipeline.state_dict()
-    write_state(folder / CHECKPOINT, metadata, state)
+    write_state(folder / RunFile.CHECKPOINT, metadata, state)
 
 
 def is_finished(folder: Path) -> bool:
@@ -130,7 +126,7 @@ def is_finished(folder: Path) -> bool:
     Raises:
         InputError: If its ``metrics.json`` is damaged.
     """
-    path = folder / "metrics.json"
+    path = folder / RunFile.METRICS
     return path.is_file() and read_metrics(path).failure is None
 
 
@@ -140,10 +136,10 @@ def read_checkpoint(folder: Path) -> Checkpoint:
     Raises:
         InputError: If there is no checkpoint, or if it is damaged, from another version or of a live stream.
     """
-    path = folder / CHECKPOINT
+    path = folder / RunFile.CHECKPOINT
     if not path.is_file():
         cause = "has no checkpoint" if folder.is_dir() else "is not a folder"
-        fix = suggest_folder(folder, CHECKPOINT) or (
+        fix = suggest_folder(folder, RunFile.CHECKPOINT) or (
             "pass the folder of a run that ended early, or run the sequence again"
         )
         raise InputError(f"{folder}: {cause}; {fix}")

@@ -12,6 +12,7 @@ from v3d_torch.datasets import RGBDStream
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import Checkpoint
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.log import log_to, show_warnings
@@ -47,7 +48,7 @@ def run_with_progress(
         if checkpoint is None:
             clear_earlier_results(folder)
         compile_kernels(console)
-        log = log_to(folder / "run.log", append=checkpoint is not None)
+        log = log_to(folder / RunFile.LOG, append=checkpoint is not None)
         warnings = show_warnings(partial(print_line, console))
         with progress_bars(console) as progress, interrupts_between_frames(sequence) as interrupted, log, warnings:
             run = make_run()

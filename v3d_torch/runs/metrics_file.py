@@ -13,9 +13,6 @@ from v3d_torch.errors import InputError
 from v3d_torch.io.text import read_text
 from v3d_torch.types import TrackingStatus
 
-METRICS = "metrics.json"
-"""Name of the file."""
-
 _MAX_DEPTH = 3
 """Maximum number of folder levels above a run: a batch has sequence, configuration and seed."""
 

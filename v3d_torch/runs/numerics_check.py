@@ -18,7 +18,7 @@ from torch import Tensor
 
 from v3d_torch.errors import NumericsError
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
-from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
+from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
@@ -86,7 +86,7 @@ def _check_tensor(name: str, tensor: Tensor, *, nan: bool, infinite: bool) -> No
         raise NumericsError(f"{name} is {kind}: {count} of {tensor.numel()} numbers{position}")
 
 
-class CheckedStage(StageProxy):
+class CheckedStage(CheckingProxy):
     """Proxy of a stage that checks the results of its call and of its methods.
 
     Args:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
 from v3d_torch.io.image_file import read_image
+from v3d_torch.runs.file_names import FIGURES, MASKS
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.runs.wall_time import describe_wall_time
 from v3d_torch.viz.figure_output import embed_image, embed_svg
@@ -76,9 +77,9 @@ def render_page(run: StoredRun) -> str:
         objects=_object_plot(run),
         masked=_masked_percentages(run.metrics.masks or {}),
         pictures=[
-            (embed_image(run.folder / "figures" / name), caption)
+            (embed_image(run.folder / FIGURES / name), caption)
             for name, caption in _FIGURES.items()
-            if (run.folder / "figures" / name).is_file()
+            if (run.folder / FIGURES / name).is_file()
         ],
         stages=stages,
         describe_wall_time=describe_wall_time,
@@ -131,7 +132,7 @@ def _tracking_plots(run: StoredRun) -> dict[str, str]:
         return {}
     keyframes = run.keyframes.stamps if run.keyframes is not None else torch.zeros(0, dtype=torch.float64)
     plots = {"statuses": embed_svg(draw_statuses(run.trajectory.stamps, run.metrics.status, keyframes), "statuses")}
-    masks = [(stamp, run.folder / "masks" / f"{stamp:.6f}.png") for stamp in run.trajectory.stamps.tolist()]
+    masks = [(stamp, run.folder / MASKS / f"{stamp:.6f}.png") for stamp in run.trajectory.stamps.tolist()]
     saved = [(stamp, path) for stamp, path in masks if path.is_file()]
     if saved:
         fractions = torch.tensor([_masked_fraction(path) for _, path in saved], dtype=torch.float64)

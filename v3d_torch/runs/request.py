@@ -22,9 +22,7 @@ from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
 from v3d_torch.io.text import read_text
-
-REQUEST = "request.yaml"
-"""Name of the file with the options of a run, which is written before its first frame."""
+from v3d_torch.runs.file_names import RunFile
 
 CHANGEABLE = ("seq", "data_root", "skip_broken")
 """Names of the options that can change when a run is resumed."""
@@ -129,7 +127,7 @@ def write_request(folder: Path, request: RunRequest) -> None:
     Raises:
         OutputError: If the file cannot be written.
     """
-    write_text(folder / REQUEST, yaml.safe_dump(request.absolute()._options(), sort_keys=False))
+    write_text(folder / RunFile.REQUEST, yaml.safe_dump(request.absolute()._options(), sort_keys=False))
 
 
 def read_request(folder: Path) -> RunRequest:
@@ -141,7 +139,7 @@ def read_request(folder: Path) -> RunRequest:
     Raises:
         InputError: If the file is missing or damaged.
     """
-    path = folder / REQUEST
+    path = folder / RunFile.REQUEST
     text = read_text(path, "it is written by a run")
     try:
         options = parse_yaml(text)

@@ -13,9 +13,7 @@ from filelock import FileLock, Timeout
 
 from v3d_torch.errors import OutputError
 from v3d_torch.io.paths import folder_name
-
-_LOG = "run.log"
-"""Name of the log, which every run writes first: a folder with this file contains results of a run."""
+from v3d_torch.runs.file_names import FIGURES, MAP_MASKS, MASKS, RunFile
 
 _LOCK = ".run.lock"
 """Name of the lock file, which exists while a run or a batch writes."""
@@ -23,19 +21,14 @@ _LOCK = ".run.lock"
 _NO_LOCKS = (ENOLCK, ENOSYS, EOPNOTSUPP)
 """Error numbers of file systems without locks."""
 
-_RESULTS = (
-    *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json"),
-    *("report.html", "checkpoint.v3d", "frames.parquet", "states.parquet", "dynamics.parquet"),
-    *("map.ply", "mesh.ply", "trajectory.ply"),
-    *("occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml", "figures/occupancy.png"),
-    *("figures/trajectory.png", "figures/masks.png", "figures/voting.png", "figures/clusters.png"),
-    "figures/objects.png",
-    *("masks/*.png", "map_masks/*.png"),
-)
-"""Names of the files that a run, or the report of a run, writes in addition to the log."""
+_RESULTS = (*(file.value for file in RunFile if file is not RunFile.LOG), f"{MASKS}/*.png", f"{MAP_MASKS}/*.png")
+"""Patterns of the files that a run, or the report of a run, writes in addition to the log."""
 
-_UNFINISHED = (".*.part*", "figures/.*.part*", "masks/.*.part*", "map_masks/.*.part*")
-"""Pattern of the temporary files of a run that was killed while it wrote."""
+_SUBFOLDERS = (FIGURES, MASKS, MAP_MASKS)
+"""Folders of images."""
+
+_UNFINISHED = (".*.part*", *(f"{subfolder}/.*.part*" for subfolder in _SUBFOLDERS))
+"""Patterns of the temporary files of a run that was killed while it wrote."""
 
 
 def make_result_folder(out: Path | None, name: str) -> Path:
@@ -137,13 +130,13 @@ def clear_earlier_results(folder: Path) -> None:
     """
     try:
         earlier = [path for pattern in (*_RESULTS, *_UNFINISHED) for path in sorted(folder.glob(pattern))]
-        if earlier and not (folder / _LOG).is_file():
+        if earlier and not (folder / RunFile.LOG).is_file():
             raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
         for path in earlier:
             path.unlink()
-        for subfolder in (folder / "figures", folder / "masks", folder / "map_masks"):
+        for subfolder in _SUBFOLDERS:
             with suppress(OSError):  # missing, or with other files in it
-                subfolder.rmdir()
+                (folder / subfolder).rmdir()
     except OSError as error:
         raise _unwritable_error(folder, error) from error
 

@@ -20,14 +20,15 @@ from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import ObjectTable
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.state_table import make_state_table
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import Trajectory
 
 _STATE_COLUMNS = (
-    *("vx", "vy", "vz", "position_sigma", "velocity_sigma"),
-    *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
-)
+    "vx", "vy", "vz", "position_sigma", "velocity_sigma",
+    "box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw",
+)  # fmt: skip
 """Columns of velocity, uncertainty and box of an object."""
 
 _DYNAMICS = pa.schema(
@@ -78,14 +79,14 @@ class ResultTables:
         Raises:
             OutputError: If the folder cannot be written or the disk is full.
         """
-        write_trajectory(folder / "trajectory.txt", self.trajectory)  # first, in case the disk gets full
-        write_text(folder / "config.yaml", self.config)
-        write_trajectory(folder / "keyframes.txt", self.keyframes)
+        write_trajectory(folder / RunFile.TRAJECTORY, self.trajectory)  # first, in case the disk gets full
+        write_text(folder / RunFile.CONFIG, self.config)
+        write_trajectory(folder / RunFile.KEYFRAMES, self.keyframes)
         if self.groundtruth is not None:
-            write_trajectory(folder / "groundtruth.txt", self.groundtruth)
-        write_parquet(folder / "frames.parquet", self.frames)
-        write_parquet(folder / "states.parquet", self.states)
-        write_parquet(folder / "dynamics.parquet", self.dynamics)
+            write_trajectory(folder / RunFile.GROUNDTRUTH, self.groundtruth)
+        write_parquet(folder / RunFile.FRAMES, self.frames)
+        write_parquet(folder / RunFile.STATES, self.states)
+        write_parquet(folder / RunFile.DYNAMICS, self.dynamics)
 
 
 def collect_tables(pipeline: Pipeline) -> ResultTables:

@@ -32,6 +32,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runs.diagnosis import diagnose
+from v3d_torch.runs.file_names import FIGURES, RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_tables import ResultTables, collect_tables
 from v3d_torch.types import TrackingStatus, Trajectory
@@ -74,7 +75,7 @@ def write_results(folder: Path, pipeline: Pipeline, request: RunRequest | None =
     if request is not None and record.failure is None:
         record.diagnosis = diagnose(pipeline, request, tables.evaluation)
     _write_maps(folder, pipeline, tables.trajectory, point_map)
-    draw_run(folder / "figures", pipeline, tables.trajectory, point_map)
+    draw_run(folder / FIGURES, pipeline, tables.trajectory, point_map)
     metrics |= {"failure": record.failure, "diagnosis": record.diagnosis, "peak_memory_mb": _peak_memory_mb()}
     _write_metrics(folder, metrics)
     return tables.evaluation
@@ -101,7 +102,7 @@ def _write_tables(folder: Path, tables: ResultTables, metrics: dict[str, object]
 
 
 def _write_metrics(folder: Path, metrics: dict[str, object]) -> None:
-    write_text(folder / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+    write_text(folder / RunFile.METRICS, json.dumps(metrics, indent=2) + "\n")
 
 
 def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, object]:
@@ -175,10 +176,10 @@ def _peak_memory_mb() -> float | None:
 
 def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:
     slam = pipeline.slam
-    write_ply(folder / "map.ply", point_map.points, point_map.colours, normals=point_map.normals)
+    write_ply(folder / RunFile.MAP, point_map.points, point_map.colours, normals=point_map.normals)
     if slam.config.dense_map.mesh.enabled:
         mesh = fuse_mesh(pipeline.views.connected(), slam.config.dense_map)
-        write_ply(folder / "mesh.ply", mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
+        write_ply(folder / RunFile.MESH, mesh.vertices, mesh.colours, normals=mesh.normals, faces=mesh.faces)
     if slam.occupancy is not None:
         _write_occupancy(folder, slam.occupancy)
     keyframes = slam.map.active_keyframes
@@ -187,15 +188,15 @@ def _write_maps(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_
     positions = torch.searchsorted(trajectory.stamps, stamps).masked_fill(known, -1)
     T_wk, camera = invert(stack_poses(keyframes)), pipeline.sequence.camera
     path = make_camera_path(trajectory, slam.poses.statuses, T_wk, positions, camera)
-    write_ply(folder / "trajectory.ply", path.points, path.colours, faces=path.faces, edges=path.edges)
+    write_ply(folder / RunFile.CAMERA_PATH, path.points, path.colours, faces=path.faces, edges=path.edges)
 
 
 def _write_occupancy(folder: Path, mapper: OccupancyMapper) -> None:
     """Write the occupancy map, and its 2D grid if a floor is visible."""
     floor = mapper.find_floor()
-    save_occupancy(folder / "occupancy.npz", mapper.map, floor)
-    write_octomap(folder / "occupancy.bt", mapper.map)
+    save_occupancy(folder / RunFile.OCCUPANCY, mapper.map, floor)
+    write_octomap(folder / RunFile.OCTOMAP, mapper.map)
     if floor is None:
         _LOG.warning("occupancy map: no floor is visible; no 2D grid was written")
     else:
-        write_map_server_files(folder / "map.yaml", occupancy_grid(mapper.map, floor))
+        write_map_server_files(folder / RunFile.GRID, occupancy_grid(mapper.map, floor))

@@ -24,8 +24,9 @@ from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
+from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
 from v3d_torch.runs.numerics_check import CheckedSLAM
-from v3d_torch.runs.request import REQUEST, RunRequest, write_request
+from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
@@ -73,7 +74,7 @@ class Run:
         save_checkpoints: bool = True,
     ) -> None:
         config = request.config
-        write_text(folder / "config.yaml", dump_config(config))  # fails before the first frame if the disk is full
+        write_text(folder / RunFile.CONFIG, dump_config(config))  # fails before the first frame if the disk is full
         write_request(folder, request)
         set_num_threads(config.threads)
         torch.manual_seed(config.seed)
@@ -86,10 +87,10 @@ class Run:
         self.pipeline = Pipeline(
             sequence,
             slam,
-            folder / "masks" if request.save_masks else None,
+            folder / MASKS if request.save_masks else None,
             viewer,
             None if known_map is None else known_map.views,
-            map_masks=folder / "map_masks" if request.save_masks else None,
+            map_masks=folder / MAP_MASKS if request.save_masks else None,
             skip_broken=request.skip_broken,
         )
         if checkpoint is not None:
@@ -152,7 +153,7 @@ class Run:
 
     def _restore_folder(self) -> None:
         """Write the request again if the folder was removed during the run, and warn of what is lost."""
-        if not (self._folder / REQUEST).is_file():
+        if not (self._folder / RunFile.REQUEST).is_file():
             write_request(self._folder, self._request)
             self.pipeline.warn(
                 [f"{self._folder}: was removed during the run; what was written before is lost, such as log and masks"]

@@ -17,11 +17,10 @@ from v3d_torch.errors import InputError
 from v3d_torch.export.posed_image import PosedImage
 from v3d_torch.io.download import Progress
 from v3d_torch.io.image_file import read_image
+from v3d_torch.runs.file_names import MAP_MASKS
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.types import RGBDFrame, Trajectory
-
-_MASKS = "map_masks"
 
 _STAMP_TOLERANCE = 2e-6
 """Tolerance of timestamps, seconds: files have six decimals."""
@@ -113,7 +112,7 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, m
     Raises:
         InputError: If the run saved no masks, or the source has fewer frames than the run had.
     """
-    folder = run.folder / _MASKS
+    folder = run.folder / MAP_MASKS
     if masks and not folder.is_dir():
         raise InputError(
             f"{run.folder}: has no masks; run the sequence again with --save-masks, or do not mask with --no-masks"

@@ -32,11 +32,11 @@ from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 
 STATE_CLASSES: tuple[type, ...] = (
-    *(TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, TrackingStatus, CameraState),
-    *(Keyframe, Loop, TensorTable, Readout, StageTime),
-    *(StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig),
-    *(RangeView, Floor, UpDirection),
-)
+    TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, TrackingStatus, CameraState,
+    Keyframe, Loop, TensorTable, Readout, StageTime,
+    StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig,
+    RangeView, Floor, UpDirection,
+)  # fmt: skip
 """Classes of the package that a saved state can contain; others are not read."""
 
 

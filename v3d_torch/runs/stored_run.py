@@ -14,7 +14,8 @@ from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.io.text import read_text
-from v3d_torch.runs.metrics_file import METRICS, Metrics, read_metrics, suggest_folder
+from v3d_torch.runs.file_names import RunFile
+from v3d_torch.runs.metrics_file import Metrics, read_metrics, suggest_folder
 from v3d_torch.types import Trajectory
 
 
@@ -59,14 +60,14 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         InputError: If the folder has no results, a file is damaged, or the given ground truth has too few timestamps in
             common with the trajectory.
     """
-    if not (folder / METRICS).is_file():
+    if not (folder / RunFile.METRICS).is_file():
         raise InputError(
-            f"{folder}: has no results of a run ({METRICS} is missing);"
-            f" {suggest_folder(folder, METRICS) or 'pass the folder that the run printed at its end'}"
+            f"{folder}: has no results of a run ({RunFile.METRICS} is missing);"
+            f" {suggest_folder(folder, RunFile.METRICS) or 'pass the folder that the run printed at its end'}"
         )
-    config_path = folder / "config.yaml"
+    config_path = folder / RunFile.CONFIG
     config_text = read_text(config_path, "it is a configuration in YAML") if config_path.is_file() else ""
-    metrics, trajectory = read_metrics(folder / METRICS), _read_poses(folder / "trajectory.txt")
+    metrics, trajectory = read_metrics(folder / RunFile.METRICS), _read_poses(folder / RunFile.TRAJECTORY)
     frames = len(metrics.status)
     if trajectory is not None and metrics.failure is not None:
         # If the run was killed after it wrote the trajectory and before metrics.json, the trajectory has more poses.
@@ -76,7 +77,7 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
             f"{folder}: trajectory.txt has {len(trajectory)} poses and metrics.json {frames} frames, so they belong to"
             " different runs; run the sequence again"
         )
-    truth_path = groundtruth or folder / "groundtruth.txt"
+    truth_path = groundtruth or folder / RunFile.GROUNDTRUTH
     truth = read_trajectory(truth_path) if groundtruth is not None or truth_path.is_file() else None
     evaluation = None
     if truth is not None and trajectory is not None and metrics.is_localised:
@@ -89,12 +90,12 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         folder=folder,
         metrics=metrics,
         trajectory=trajectory,
-        keyframes=_read_poses(folder / "keyframes.txt"),
+        keyframes=_read_poses(folder / RunFile.KEYFRAMES),
         groundtruth=truth,
         evaluation=evaluation,
-        frames=_read_table(folder / "frames.parquet", ("frame", "stamp", "status", "keyframe")),
+        frames=_read_table(folder / RunFile.FRAMES, ("frame", "stamp", "status", "keyframe")),
         dynamics=_read_table(
-            folder / "dynamics.parquet", ("frame", "stamp", "id", "class", "votes", "chamfer", "motion_state", "missed")
+            folder / RunFile.DYNAMICS, ("frame", "stamp", "id", "class", "votes", "chamfer", "motion_state", "missed")
         ),
         config_text=config_text,
         config=_read_config(config_path),

@@ -1,4 +1,4 @@
-"""Proxy of a stage: base class of wrappers that check or show the results of the stage."""
+"""Proxies of stages: base classes of wrappers that show or check the results of a stage."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
 
 
 class StageProxy:
-    """Proxy that checks the results of a stage; attributes are read from and written to the stage itself.
+    """Proxy of a stage: attributes are read from and written to the stage itself.
 
     To `isinstance`, a proxy is of the class of the stage: a segmenter that is a torch module, for example, has no state
     that changes from frame to frame.
@@ -30,16 +30,6 @@ class StageProxy:
     def __class__(self) -> type:
         return self._stage.__class__
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
-        """Call the stage and check its result."""
-        result = self._stage(*args, **kwargs)
-        self._check(result, *args)
-        return result
-
-    def _check(self, result: Any, *args: Any) -> None:
-        """Check the result of a call; the positional arguments of the call are passed on."""
-        raise NotImplementedError
-
     def __getattr__(self, name: str) -> Any:
         if name in self._OWN:  # read before it is set, for example by copy
             raise AttributeError(name)
@@ -50,3 +40,17 @@ class StageProxy:
             super().__setattr__(name, value)
         else:
             setattr(self._stage, name, value)
+
+
+class CheckingProxy(StageProxy):
+    """Proxy that checks the results of a stage."""
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the stage and check its result."""
+        result = self._stage(*args, **kwargs)
+        self._check(result, *args)
+        return result
+
+    def _check(self, result: Any, *args: Any) -> None:
+        """Check the result of a call; the positional arguments of the call are passed on."""
+        raise NotImplementedError

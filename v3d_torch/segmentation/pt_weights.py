@@ -20,19 +20,19 @@ from v3d_torch.segmentation.weights import sha256_of
 
 _MODULE_CLASSES = {
     "torch.nn.modules": (
-        *("activation.SiLU", "batchnorm.BatchNorm2d", "container.ModuleList", "container.Sequential", "conv.Conv2d"),
-        *("conv.ConvTranspose2d", "linear.Identity", "pooling.MaxPool2d", "upsampling.Upsample"),
+        "activation.SiLU", "batchnorm.BatchNorm2d", "container.ModuleList", "container.Sequential", "conv.Conv2d",
+        "conv.ConvTranspose2d", "linear.Identity", "pooling.MaxPool2d", "upsampling.Upsample",
     ),
     "ultralytics.nn": (
         "tasks.SegmentationModel",
-        *("modules.Bottleneck", "modules.C2f", "modules.Concat", "modules.Conv", "modules.DFL", "modules.Detect"),
-        *("modules.Proto", "modules.SPPF", "modules.Segment"),
-        *("modules.block.Attention", "modules.block.Bottleneck", "modules.block.C2PSA", "modules.block.C3k"),
-        *("modules.block.C3k2", "modules.block.DFL", "modules.block.PSABlock", "modules.block.Proto"),
-        *("modules.block.Proto26", "modules.block.SPPF", "modules.conv.Concat", "modules.conv.Conv"),
-        *("modules.conv.DWConv", "modules.head.Detect", "modules.head.Segment", "modules.head.Segment26"),
+        "modules.Bottleneck", "modules.C2f", "modules.Concat", "modules.Conv", "modules.DFL", "modules.Detect",
+        "modules.Proto", "modules.SPPF", "modules.Segment",
+        "modules.block.Attention", "modules.block.Bottleneck", "modules.block.C2PSA", "modules.block.C3k",
+        "modules.block.C3k2", "modules.block.DFL", "modules.block.PSABlock", "modules.block.Proto",
+        "modules.block.Proto26", "modules.block.SPPF", "modules.conv.Concat", "modules.conv.Conv",
+        "modules.conv.DWConv", "modules.head.Detect", "modules.head.Segment", "modules.head.Segment26",
     ),
-}
+}  # fmt: skip
 
 
 class _InertModule:

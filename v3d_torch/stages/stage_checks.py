@@ -21,7 +21,7 @@ from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
 from v3d_torch.runtime.stage_hooks import HookedStage, StageHook
 from v3d_torch.runtime.stage_import import make_stage
-from v3d_torch.runtime.stage_proxy import STATE_METHODS, StageProxy
+from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
 from v3d_torch.runtime.stateful import Stateful, is_stateful
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
@@ -172,7 +172,7 @@ class ReplaceableStages:
                 setattr(self, name, make_stage(name, path, config, camera))
 
 
-class ReplacedStage(StageProxy):
+class ReplacedStage(CheckingProxy):
     """Proxy of a user-defined stage that checks types, shapes, dtypes and devices of its results.
 
     Args:
@@ -184,7 +184,7 @@ class ReplacedStage(StageProxy):
         ConfigError: If the original stage is callable and this one is not.
     """
 
-    _OWN = StageProxy._OWN | {"_replaced"}
+    _OWN = CheckingProxy._OWN | {"_replaced"}
 
     def __init__(self, stage: Any, name: str, replaced: Any) -> None:
         super().__init__(stage, name)

@@ -74,7 +74,7 @@ class PoseHistory:
     def is_located(self) -> bool:
         """True if the pose of the last frame is known relative to the whole map; False before the first."""
         status, keyframe = self.status, self.keyframe
-        return status is not None and status.is_located and not (keyframe is not None and keyframe.disconnected)
+        return status is not None and status.is_located and not (keyframe is not None and keyframe.is_disconnected)
 
     @property
     def part(self) -> int:
@@ -180,7 +180,7 @@ class PoseHistory:
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""
-        disconnected = keyframe is not None and keyframe.disconnected
+        disconnected = keyframe is not None and keyframe.is_disconnected
         found = TrackingStatus.DISCONNECTED if disconnected else TrackingStatus.ODOMETRY
         frames = self._frames
         for row in reversed(range(len(frames))):
@@ -206,7 +206,7 @@ class PoseHistory:
     def _current_status(self, code: int, keyframe: int) -> TrackingStatus:
         """Return the status of a row: a loop can have joined the part of the map of its keyframe with the rest."""
         status, reference = _STATUSES[code], self._keyframes.get(keyframe)
-        is_joined = reference is not None and not reference.disconnected
+        is_joined = reference is not None and not reference.is_disconnected
         return TrackingStatus.TRACKED if status is TrackingStatus.DISCONNECTED and is_joined else status
 
     def _pose_of(self, row: int) -> Tensor:
@@ -223,7 +223,7 @@ class PoseHistory:
 def _status(pose: FramePose, keyframe: Keyframe | None, *, is_new: bool) -> TrackingStatus:
     """Return the status of a frame, given its reference keyframe, or the new keyframe created from it."""
     is_in_map = is_new or pose.status is TrackingStatus.TRACKED
-    if is_in_map and keyframe is not None and keyframe.disconnected:
+    if is_in_map and keyframe is not None and keyframe.is_disconnected:
         return TrackingStatus.DISCONNECTED
     starts_map = is_new and pose.status is TrackingStatus.LOST
     return TrackingStatus.TRACKED if starts_map else pose.status

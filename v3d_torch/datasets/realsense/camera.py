@@ -47,7 +47,12 @@ def camera_from_intrinsics(name: str, intrinsics: Any, depth_unit: float) -> Pin
     """
     coefficients, model = _distortion(name, intrinsics)
     return PinholeCamera(
-        *(intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy, intrinsics.width, intrinsics.height),
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.ppx,
+        cy=intrinsics.ppy,
+        width=intrinsics.width,
+        height=intrinsics.height,
         distortion=coefficients,
         depth_scale=depth_scale_from(depth_unit),
         distortion_model=model,

@@ -91,7 +91,11 @@ def _arrow(stamp: float, each: TrackedObject, T_mw: Tensor) -> Marker:
     start = points_in_map(each.centroid, T_mw)
     end = points_in_map(each.state.predict(each.state.stamp + 1.0).position, T_mw)
     return _marker(
-        *(stamp, "velocities", each.id, Marker.ARROW, each.motion_state.value),
+        stamp,
+        "velocities",
+        each.id,
+        Marker.ARROW,
+        each.motion_state.value,
         size=torch.tensor(_ARROW),
         points=[start, end],
     )
