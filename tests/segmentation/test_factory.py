@@ -33,7 +33,7 @@ def test_make_segmenter_creates_the_configured_source(tmp_path: Path) -> None:
     baseline = make(source="none")
     assert isinstance(baseline, NoSegmentation)
     assert baseline(frame).masks.shape == (0, 400, 600)
-    with pytest.raises(ConfigError, match="the folder of the id images is missing; name it with --masks"):
+    with pytest.raises(ConfigError, match="the folder of the id images is missing; only `run` takes one, with --masks"):
         make(source="masks")
     Image.fromarray(np.zeros((400, 600), dtype=np.uint8)).save(tmp_path / "a.png")
     assert isinstance(make({"masks_dir": tmp_path}, source="masks"), MaskFolder)

@@ -83,6 +83,8 @@ def make_instance_source(
         return NoSegmentation()
     if config.source == "masks":
         if masks_dir is None:
-            raise ConfigError("segmentation.source=masks: the folder of the id images is missing; name it with --masks")
+            raise ConfigError(
+                "segmentation.source=masks: the folder of the id images is missing; only `run` takes one, with --masks"
+            )
         return MaskFolder(masks_dir)
     return YOLOSegmenter(config, weights)
