@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import pytest
+import torch
 from helpers.commands import assert_error_line
 from helpers.demo_frames import copy_frames
 from typer.testing import CliRunner, Result
@@ -16,6 +17,7 @@ from v3d_torch.cli import calibrate
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.datasets.cameras import load_camera
+from v3d_torch.types import Instances, RGBDFrame
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +25,10 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sequence") / "walk"
     copy_frames(folder, range(0, 60, 5))
     return folder
+
+
+def segment_with_nan(frame: RGBDFrame) -> Instances:
+    return replace(Instances.empty(*frame.image.shape[1:]), boxes=torch.full((1, 4), torch.nan))
 
 
 def call(*arguments: str | Path) -> Result:
@@ -69,3 +75,15 @@ def test_estimated_depth_scale_and_damaged_ground_truth_are_told(sequence: Path,
     assert "note: millimetres: depth scale 1000 (millimetres), estimated from " in done.stdout
     assert_error_line(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite")
     assert not (tmp_path / "new.yaml").exists()
+
+
+def test_configuration_without_map_is_an_error(sequence: Path, tmp_path: Path) -> None:
+    options = "--seq", sequence, "--segmenter", "none", "--out", tmp_path / "new.yaml"
+    assert_error_line(call(*options, "--set", "mapping.enabled=false"), "mapping.enabled=false: there is no map")
+    assert not (tmp_path / "new.yaml").exists()
+
+
+def test_numerics_are_checked(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v3d_torch.segmentation.make_segmenter", lambda *_: segment_with_nan)
+    options = "--seq", sequence, "--segmenter", "none", "--out", tmp_path / "new.yaml"
+    assert_error_line(call(*options, "--set", "check_numerics=true"), "frame 0: segment.boxes is NaN")

@@ -33,6 +33,7 @@ from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import check_unlocked, make_result_folder
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.segmentation import MaskFolder, make_segmenter
 from v3d_torch.viz.viewer import make_viewer
@@ -109,8 +110,7 @@ def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
     Raises:
         V3DError: If an input is not valid, or the run ended early; its results so far are written.
     """
-    if request.load_map is None and not request.config.mapping.enabled:
-        raise ConfigError("mapping.enabled=false: there is no map to localise in; pass one with --load-map")
+    check_map_is_given(request.config, request.load_map)
     _run(request, out, None, display)
 
 
