@@ -282,8 +282,13 @@ CASES = [
     ),
     Case(
         "--set with a tiny voxel size",
-        setting("dense_map.voxel_size=1e-30"),
-        Fails("--set: dense_map.voxel_size: input should be between 1e-09 and 1e+09, got 1e-30"),
+        setting("dense_map.voxel_size=1e-9"),
+        Fails("--set: dense_map.voxel_size: input should be greater than or equal to 0.001, got 1e-09"),
+    ),
+    Case(
+        "--set with a tiny number",
+        setting("depth.sigma=1e-30"),
+        Fails("--set: depth.sigma: input should be between 1e-09 and 1e+09, got 1e-30"),
     ),
     Case(
         "negative --seed",
