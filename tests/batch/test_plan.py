@@ -28,6 +28,12 @@ def test_configuration_without_map_is_rejected() -> None:
         check_configs([load_config(), load_config(overrides="mapping.enabled=false")])
 
 
+def test_configuration_with_a_seed_is_rejected() -> None:
+    check_configs([load_config(overrides="seed=0")])
+    with pytest.raises(ConfigError, match=r"^seed=5: batch and ablate set the seeds 0, 1, \.\.\.; use --seeds$"):
+        check_configs([load_config(), load_config(overrides="seed=5")])
+
+
 def test_jobs_store_the_folder_of_the_variable_for_other_machines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -41,13 +41,15 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
 
 
 def check_configs(configs: Iterable[Config]) -> None:
-    """Check that configurations need no inputs of a single run.
+    """Check that configurations set no seed, which the batch sets, and need no inputs of a single run.
 
     Raises:
-        ConfigError: If a configuration localises the camera in a map.
+        ConfigError: If a configuration sets another seed than the default, or localises the camera in a map.
     """
     for config in configs:
         check_map_is_given(config)
+        if config.seed != Config().seed:
+            raise ConfigError(f"seed={config.seed}: batch and ablate set the seeds 0, 1, ...; use --seeds")
 
 
 def prepare_stages(configs: Mapping[str, Config]) -> None:
