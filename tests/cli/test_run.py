@@ -268,6 +268,11 @@ def test_unknown_key_is_rejected_with_the_nearest_key(sequence: Path, tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_model_without_network_is_rejected(sequence: Path, tmp_path: Path) -> None:
+    options = "--seq", sequence, "--segmenter", "none", "--model", "yolo11n-seg", "--out", tmp_path / "out"
+    assert_error_line(call_here(*options, cwd=tmp_path), "--model yolo11n-seg: not used with segmentation.source=none")
+
+
 def test_unknown_sequence_is_rejected_with_the_nearest_name(tmp_path: Path) -> None:
     assert_error_line(call_here("--seq", "fr3/w/xzy", cwd=tmp_path), "fr3/w/xzy", "fr3/w/xyz")
     assert list(tmp_path.iterdir()) == []

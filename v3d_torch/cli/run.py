@@ -85,6 +85,7 @@ def main(
     with quick_imports():
         from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
         from v3d_torch.runs.request import RunRequest
+        from v3d_torch.segmentation.factory import check_network_is_used
 
     if seq is None and resume is None:
         raise typer.BadParameter("give a sequence, or a run to resume (--resume)", param_hint="--seq")
@@ -99,9 +100,12 @@ def main(
     overrides += ["prefetch=false"] if serial else []
     choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, bag, profile)
     with exit_on_error():
+        loaded = choice.load()
+        if model is not None:
+            check_network_is_used(f"--model {model}", loaded)
         request = RunRequest(
             seq=seq or "",
-            config=choice.load(),
+            config=loaded,
             data_root=_text(data_root),
             camera=camera,
             rgb_topic=rgb_topic,
