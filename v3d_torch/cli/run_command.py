@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sized
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sized
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -46,24 +47,42 @@ class ConfigChoice:
     Attributes:
         name: Name or file of a configuration; None for the default.
         overrides: Values to set, such as ``objects.voting.distance_threshold=0.05``.
+        options: Values to set by the options that stand for them, as they are typed: ``seed=3`` by ``--seed 3``.
     """
 
     name: str | None
     overrides: tuple[str, ...]
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def load(self) -> Config:
         """Load the configuration.
 
         Raises:
-            ConfigError: If the name, a key or a value is not valid.
+            ConfigError: If the name, a key or a value is not valid, or if an option and an override set the same key to
+                different values.
         """
-        return load_config(find_config(self.name or FULL), self.overrides)
+        config = load_config(find_config(self.name or FULL), self.overrides)
+        for option, override in self.options.items():
+            changed = override_config(config, [override])
+            key = override.partition("=")[0]
+            if changed != config and (other := next(filter(partial(_sets, key), self.overrides), None)) is not None:
+                raise ConfigError(f"{option}: conflicts with --set {other}; remove one of them")
+            config = changed
+        return config
 
     def conflict(self, config: Config) -> str | None:
-        """Return the first option that would change a configuration; None if there is none."""
+        """Return the first option that would change a configuration, as it is typed; None if there is none."""
         if self.name is not None and self.load() != config:
             return f"--config {self.name}"
-        return next((override for override in self.overrides if override_config(config, [override]) != config), None)
+        given = {**{f"--set {override}": override for override in self.overrides}, **self.options}
+        return next(
+            (option for option, override in given.items() if override_config(config, [override]) != config), None
+        )
+
+
+def _sets(key: str, override: str) -> bool:
+    """Check whether an override sets the value of a key."""
+    return override.partition("=")[0].strip() == key
 
 
 @dataclass(frozen=True)
