@@ -281,6 +281,7 @@ def test_model_without_network_is_rejected(sequence: Path, tmp_path: Path) -> No
             ("--occupancy", "--set", "occupancy.enabled=false"),
             "--occupancy: conflicts with --set occupancy.enabled=fal",
         ),
+        (("--config", ""), "'': is neither the name of a configuration"),
         (("--serial", "--set", " prefetch = true"), "--serial: conflicts with --set  prefetch = true; remove one of t"),
         (
             ("--masks", "ids", "--set", "segmentation.source=none"),
@@ -288,7 +289,7 @@ def test_model_without_network_is_rejected(sequence: Path, tmp_path: Path) -> No
         ),
     ],
 )
-def test_option_and_override_with_different_values_are_rejected(
+def test_options_of_the_configuration_that_conflict_or_are_empty_are_rejected(
     options: tuple[str, ...], message: str, sequence: Path, tmp_path: Path
 ) -> None:
     assert_error_line(call_here("--seq", sequence, *options, "--out", tmp_path / "out", cwd=tmp_path), message)

@@ -61,7 +61,7 @@ class ConfigChoice:
             ConfigError: If the name, a key or a value is not valid, or if an option and an override set the same key to
                 different values.
         """
-        config = load_config(find_config(self.name or FULL), self.overrides)
+        config = load_config(find_config(FULL if self.name is None else self.name), self.overrides)
         for option, override in self.options.items():
             changed = override_config(config, [override])
             key = override.partition("=")[0]
