@@ -286,8 +286,8 @@ CASES = [
     ),
     Case(
         "--set with a tiny voxel size",
-        setting("dense_map.voxel_size=1e-9"),
-        Fails("--set: dense_map.voxel_size: input should be greater than or equal to 0.001, got 1e-09"),
+        setting("dense_map.voxel_size=0.0001"),
+        Fails("--set: dense_map.voxel_size: input should be greater than or equal to 0.001, got 0.0001"),
     ),
     Case(
         "--set with a tiny number",
