@@ -322,7 +322,8 @@ class MappingConfig(Section):
     last keyframe, is lower (ORB-SLAM2 for RGB-D), and if it adds `tracking.min_inliers` landmarks."""
     min_tracked: int = Field(100, gt=0)
     """A frame becomes a keyframe if it tracks fewer landmarks, adds `tracking.min_inliers` landmarks, and is at least
-    the fourth after the last keyframe."""
+    the fourth after the last keyframe. A frame with fewer static features with depth does not start a map: keep
+    it well below `features.count`."""
     map_by_odometry_after: float = Field(0.5, ge=0)
     """Time since the camera was last tracked in the map after which keyframes are created with the pose of the
     odometry, seconds. Odometry drifts, and usually the camera is tracked in the map again earlier."""
