@@ -13,6 +13,10 @@ class ConfigError(V3DError):
     """A configuration has an unknown key, or a value of the wrong type or range."""
 
 
+class StageError(V3DError):
+    """A stage that the configuration names by its import path raised an error, which is the cause of this one."""
+
+
 class DownloadError(V3DError):
     """A download failed: no network, wrong size or wrong checksum."""
 

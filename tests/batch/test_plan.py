@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 from helpers.walker_folder import write_walker
 
-from v3d_torch.batch.plan import load_configs, plan_jobs
+from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
+from v3d_torch.errors import ConfigError
 
 
 def test_load_configs_drops_repetitions_and_limits_threads(tmp_path: Path) -> None:
@@ -19,6 +20,18 @@ def test_load_configs_drops_repetitions_and_limits_threads(tmp_path: Path) -> No
     assert list(configs) == ["full", "mine"] and configs["full"] == load_config()
     one, two = load_configs([mine], one_thread=True)["mine"], configs["mine"]
     assert [(config.threads, config.segmentation.threads) for config in (one, two)] == [(1, 1), (2, 2)]
+
+
+def test_configuration_without_map_is_rejected() -> None:
+    check_configs([load_config()])
+    with pytest.raises(ConfigError, match=r"^mapping\.enabled=false: there is no map to localise in; only `run` takes"):
+        check_configs([load_config(), load_config(overrides="mapping.enabled=false")])
+
+
+def test_configuration_with_a_seed_is_rejected() -> None:
+    check_configs([load_config(overrides="seed=0")])
+    with pytest.raises(ConfigError, match=r"^seed=5: batch and ablate set the seeds 0, 1, \.\.\.; use --seeds$"):
+        check_configs([load_config(), load_config(overrides="seed=5")])
 
 
 def test_jobs_store_the_folder_of_the_variable_for_other_machines(

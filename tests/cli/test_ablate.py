@@ -147,6 +147,9 @@ def test_help_lists_variants_and_does_not_import_torch() -> None:
     [
         (("--variants", "baseline,no_chamfr"), ("no_chamfr", "no_chamfer")),
         (("--set", "objects.voting.vote_treshold=3"), ("objects.voting.vote_threshold",)),
+        (("--set", "seed=5"), ("seed=5", "--seeds")),
+        (("--set", "mapping.enabled=false"), ("mapping.enabled=false", "only `run` takes one")),
+        (("--set", "segmentation.source=masks"), ("segmentation.source=masks", "only `run` takes one")),
         (("--seq", "fr3/w/xzy"), ("fr3/w/xyz",)),
         (("--seq", "nowhere/at/all"), ("nowhere/at/all",)),
     ],

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import pytest
+import torch
 from helpers.commands import assert_error_line, invoke
 from helpers.demo_frames import copy_frames
 
@@ -16,6 +17,7 @@ from v3d_torch.cli import calibrate
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.datasets.cameras import load_camera
+from v3d_torch.types import Instances, RGBDFrame
 
 
 @pytest.fixture(scope="module")
@@ -26,6 +28,10 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 call = partial(invoke, calibrate.app, COLUMNS="200")
+
+
+def segment_with_nan(frame: RGBDFrame) -> Instances:
+    return replace(Instances.empty(*frame.image.shape[1:]), boxes=torch.full((1, 4), torch.nan))
 
 
 @pytest.mark.parametrize(("factor", "features"), [(1.15, 500), (0.5, 1500)])
@@ -68,3 +74,15 @@ def test_estimated_depth_scale_and_damaged_ground_truth_are_told(sequence: Path,
     assert "note: millimetres: depth scale 1000 (millimetres), estimated from " in done.stdout
     assert_error_line(done, f"{folder / 'groundtruth.txt'}: line 1 has a number that is not finite")
     assert not (tmp_path / "new.yaml").exists()
+
+
+def test_configuration_without_map_is_an_error(sequence: Path, tmp_path: Path) -> None:
+    options = "--seq", sequence, "--segmenter", "none", "--out", tmp_path / "new.yaml"
+    assert_error_line(call(*options, "--set", "mapping.enabled=false"), "mapping.enabled=false: there is no map")
+    assert not (tmp_path / "new.yaml").exists()
+
+
+def test_numerics_are_checked(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("v3d_torch.segmentation.make_segmenter", lambda *_: segment_with_nan)
+    options = "--seq", sequence, "--segmenter", "none", "--out", tmp_path / "new.yaml"
+    assert_error_line(call(*options, "--set", "check_numerics=true"), "frame 0: segment.boxes is NaN")

@@ -70,6 +70,19 @@ def test_missing_module_is_one_line_before_the_run(sequence: Path, tmp_path: Pat
     assert_error_line(done, "stages.odometry=no_lab:PnP: the module no_lab cannot be imported", "PYTHONPATH")
 
 
+def test_failure_of_a_stage_is_named_and_the_log_has_its_traceback(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "failing.py").write_text(
+        "class Boom:\n    def __init__(self, config, camera): pass\n    def __call__(self, frame): return 1 / 0\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    stage = "stages.segment=failing:Boom"
+    done = call_here("--seq", sequence, "--out", tmp_path / "out", "--set", stage, cwd=tmp_path)
+    assert_error_line(done, f"error: {stage} failed with ZeroDivisionError: division by zero (the results of the 0 fra")
+    assert "return 1 / 0" in (tmp_path / "out" / "run.log").read_text()
+
+
 def test_configuration_file_gives_the_same_results(sequence: Path, own: Path, tmp_path: Path) -> None:
     (tmp_path / "lab.yaml").write_text(f"stages:\n  segment: {MODULE}:Corner\n")
     for name, option in (("a", ("--set", SEGMENT)), ("b", ("--config", tmp_path / "lab.yaml"))):

@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from v3d_torch.cli.record import app
 from v3d_torch.cli.record_command import record_all
 from v3d_torch.datasets import RGBDSequence, load_sequence, tum_writer
 from v3d_torch.io.files import write_png
-from v3d_torch.types import RGBDFrame
+from v3d_torch.types import Instances, RGBDFrame
 
 K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
 LISTS = {"rgb.txt", "depth.txt", "associations.txt", "camera.yaml"}
@@ -139,6 +140,33 @@ def test_interrupt_while_a_frame_is_written_is_raised(tmp_path: Path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         record_all(Slide(0, 18, step=6), tmp_path / "out", threading.Event(), Console(quiet=True))
     assert len(load_sequence(str(tmp_path / "out"))) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("mapping: {enabled: false}", "mapping.enabled=false: there is no map"),
+        (
+            "segmentation: {source: masks}",
+            "segmentation.source=masks: the folder of the id images is missing; only `run`",
+        ),
+    ],
+)
+def test_configuration_with_inputs_of_a_run_is_an_error(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text(text)
+    static = "--seq", "demo", "--static", "--config", tmp_path / "own.yaml", "--out", tmp_path / "out"
+    assert_error_line(call(*static), message)
+    assert not (tmp_path / "out").exists()
+
+
+def test_numerics_of_a_static_recording_are_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def segment(frame: RGBDFrame) -> Instances:
+        return replace(Instances.empty(*frame.image.shape[1:]), boxes=torch.full((1, 4), torch.nan))
+
+    monkeypatch.setattr("v3d_torch.cli.record_command.make_segmenter", lambda *_: segment)
+    (tmp_path / "own.yaml").write_text("check_numerics: true\nsegmentation: {source: none}")
+    static = "--seq", "demo", "--static", "--config", tmp_path / "own.yaml", "--out", tmp_path / "out"
+    assert_error_line(call(*static), "frame 0: segment.boxes is NaN")
 
 
 def test_nonempty_folder_and_missing_camera_are_errors(tmp_path: Path) -> None:

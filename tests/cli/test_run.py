@@ -268,6 +268,34 @@ def test_unknown_key_is_rejected_with_the_nearest_key(sequence: Path, tmp_path: 
     assert list(tmp_path.iterdir()) == []
 
 
+def test_model_without_network_is_rejected(sequence: Path, tmp_path: Path) -> None:
+    options = "--seq", sequence, "--segmenter", "none", "--model", "yolo11n-seg", "--out", tmp_path / "out"
+    assert_error_line(call_here(*options, cwd=tmp_path), "--model yolo11n-seg: not used with segmentation.source=none")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--seed", "3", "--set", "seed=4"), "--seed 3: conflicts with --set seed=4; remove one of them"),
+        (
+            ("--occupancy", "--set", "occupancy.enabled=false"),
+            "--occupancy: conflicts with --set occupancy.enabled=fal",
+        ),
+        (("--config", ""), "'': is neither the name of a configuration"),
+        (("--serial", "--set", " prefetch = true"), "--serial: conflicts with --set  prefetch = true; remove one of t"),
+        (
+            ("--masks", "ids", "--set", "segmentation.source=none"),
+            "--masks ids: conflicts with --set segmentation.sour",
+        ),
+    ],
+)
+def test_options_of_the_configuration_that_conflict_or_are_empty_are_rejected(
+    options: tuple[str, ...], message: str, sequence: Path, tmp_path: Path
+) -> None:
+    assert_error_line(call_here("--seq", sequence, *options, "--out", tmp_path / "out", cwd=tmp_path), message)
+    assert not (tmp_path / "out").exists()
+
+
 def test_unknown_sequence_is_rejected_with_the_nearest_name(tmp_path: Path) -> None:
     assert_error_line(call_here("--seq", "fr3/w/xzy", cwd=tmp_path), "fr3/w/xzy", "fr3/w/xyz")
     assert list(tmp_path.iterdir()) == []

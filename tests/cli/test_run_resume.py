@@ -379,9 +379,12 @@ def test_damaged_checkpoint_or_one_of_another_version_is_rejected(out: Path) -> 
 @pytest.mark.parametrize(
     ("options", "option"),
     [
-        (["--seed", "3"], "seed=3"),
+        (["--seed", "3"], "--seed 3"),
+        (["--set", "features.count=77"], "--set features.count=77"),
+        (["--localise"], "--localise"),
+        (["--fps", "0"], "--fps"),
         (["--config", "paper"], "--config paper"),
-        (["--segmenter", "none"], "segmentation.source=none"),
+        (["--segmenter", "none"], "--segmenter none"),
         (["--save-masks"], "--save-masks"),
         (["--load-map", "room.map"], "--load-map"),
         (["--rgb-topic", "/rgb"], "--rgb-topic"),

@@ -38,6 +38,14 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("objects.votng.vote_threshold=2", "did you mean objects.voting?"),
         ("objects.voting.votes=2", "did you mean objects.voting.vote_threshold?"),
         ("sed=2", "did you mean seed?"),
+        ("SEED=2", "did you mean seed?"),
+        ("depth.wxyz=2", "unknown key depth.wxyz; choose from kernel_size, sigma, edge_ratio"),
+        ("features.count=true", "features.count: input should be a number, got True"),
+        ("segmentation.source=no", "input should be 'yolo', 'masks' or 'none', got False"),
+        ("depth.sigma=yes", "depth.sigma: input should be a number, got True"),
+        ("depth.kernel_size=true", "depth.kernel_size: input should be a number, got True"),
+        ("objects.voting.time_spans=[0, true]", "time_spans: input should be a number, got [0, True]"),
+        ("objects.voting.time_spans=0.3", "objects.voting.time_spans: input should be a list such as [0.3], got 0.3"),
         ("seed", "write section.key=value"),
         ("seed=-1", "greater than or equal to 0"),
         ("seed=abc", "valid integer"),
@@ -46,6 +54,10 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("seed=010", "YAML reads a leading zero as octal; write 10 instead"),
         ("seed= 008", "YAML reads a leading zero as octal; write 8 instead"),
         ("segmentation.height=481", "multiple of 32"),
+        ("objects.clouds.voxel_size=1e-9", "clouds.voxel_size: input should be greater than or equal to 0.001"),
+        ("objects.free_space.min_tolerance=1e-9", "min_tolerance: input should be greater than or equal to 0.001"),
+        ("dense_map.voxel_size=1e-9", "dense_map.voxel_size: input should be greater than or equal to 0.001"),
+        ("dense_map.mesh.voxel_size=1e-9", "mesh.voxel_size: input should be greater than or equal to 0.005"),
         ("objects.free_space.time_spans=[-0.3]", "free_space.time_spans.0: input should be greater than or equal to 0"),
         ("objects.free_space.time_spans=[0.3,11]", "free_space.time_spans.1: input should be less than or equal to 10"),
         ("dense_odometry.halvings=[-1]", "dense_odometry.halvings.0: input should be greater than or equal to 0"),
@@ -64,6 +76,12 @@ def test_invalid_override_is_rejected_with_a_fix(override: str, message: str) ->
         ("!!python/object/apply:os.system ['true']", "not valid YAML"),
         ("- 1\n- 2\n", "contains a list"),
         ("seeed: 1\n", "did you mean seed?"),
+        (
+            "objects.voting.distance_threshold: 0.1\n",
+            "unknown key objects.voting.distance_threshold; write nested sections, objects: {voting:"
+            " {distance_threshold: ...}}",
+        ),
+        ("objects: {voting.enabled: true}\n", "objects.voting.enabled; write nested sections, voting: {enabled: ...}"),
     ],
 )
 def test_invalid_file_is_rejected_with_its_path(tmp_path: Path, text: str, message: str) -> None:
@@ -99,6 +117,8 @@ def test_find_config_accepts_paths_and_rejects_unknown_names_with_a_list(tmp_pat
     own = tmp_path / "own.yaml"
     own.write_text("seed: 3\n")
     assert load_config(find_config(own)).seed == 3
+    with pytest.raises(ConfigError, match=r"^'': is neither"):
+        find_config("")
     with pytest.raises(ConfigError, match=r"papper: is neither.*paper") as raised:
         find_config("papper")
     assert "no_voting" in str(raised.value)

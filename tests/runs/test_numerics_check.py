@@ -205,6 +205,27 @@ def test_infinite_box_is_attributed_to_the_segmenter(demo: RGBDSequence) -> None
         CheckedSLAM(demo.camera, segment, NO_NETWORK)(demo[0])
 
 
+def test_instance_with_too_few_pixels_for_its_appearance_is_accepted(demo: RGBDSequence) -> None:
+    def segment(frame: RGBDFrame) -> Instances:
+        mask = torch.zeros(1, 480, 640, dtype=torch.bool)
+        mask[:, 200:204, 300:304] = True  # one counted pixel
+        return Instances(mask, torch.tensor([0]), torch.tensor([0.9]), torch.tensor([[300.0, 200.0, 304.0, 204.0]]))
+
+    slam = CheckedSLAM(demo.camera, segment, NO_NETWORK)
+    appearances: list[Tensor] = []
+    slam.register_stage_hook("describe_appearance", lambda _, arguments, result: appearances.append(result))
+    for index in range(2):
+        slam(demo[index])
+    assert appearances[0].isnan().all()
+
+
+def test_infinite_appearance_is_rejected(demo: RGBDSequence) -> None:
+    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
+    slam.describe_appearance = lambda image, masks: torch.full((len(masks), 4), math.inf)
+    with pytest.raises(NumericsError, match=r"describe_appearance is infinite"):
+        slam.describe_appearance(demo[0].image, torch.ones(1, 480, 640, dtype=torch.bool))
+
+
 @pytest.mark.parametrize(
     ("change", "field"),
     [

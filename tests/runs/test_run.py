@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ import torch
 from helpers.wall_run import FRAMES, Wall, square
 
 from v3d_torch.config import Config
+from v3d_torch.config.loading import load_config
+from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runs.metrics_file import read_metrics
@@ -19,6 +22,7 @@ from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_tables import ResultTables
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.stored_run import read_run
+from v3d_torch.segmentation import MaskFolder
 from v3d_torch.types import RGBDFrame
 
 
@@ -62,6 +66,14 @@ class WallWithoutDepth(Wall):
     def __getitem__(self, index: int) -> RGBDFrame:
         frame = super().__getitem__(index)
         return RGBDFrame(frame.index, frame.stamp, frame.image, torch.zeros_like(frame.depth))
+
+
+def test_more_landmarks_than_features_are_the_cause_of_a_lost_camera(moment: Path, tmp_path: Path) -> None:
+    config = load_config(overrides=["mapping.min_tracked=900", "features.count=300"])
+    run = Run(RunRequest("moment", config), load_sequence(str(moment)), MaskFolder(moment / "masks"), tmp_path)
+    run(lambda *_: None)
+    cause = r"at most 3\d\d features of an image have depth, and a map starts with mapping\.min_tracked=900; lower it"
+    assert re.search(cause, str(run.pipeline.record.diagnosis))
 
 
 def test_run_that_never_finds_the_camera_stores_the_cause_and_no_scores(

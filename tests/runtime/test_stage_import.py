@@ -11,11 +11,33 @@ from helpers.own_stages import MODULE, write_own_stages
 
 from v3d_torch.config import Config, StagesConfig
 from v3d_torch.config.loading import dump_config, load_config
-from v3d_torch.errors import ConfigError
+from v3d_torch.errors import ConfigError, InputError, StageError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.runtime.stage_import import first_not_given, import_stage, make_stage
 
 CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+
+
+RAISING = """
+from v3d_torch.errors import InputError
+
+
+class AtStart:
+    def __init__(self, config, camera):
+        raise RuntimeError("no\\nlicence")
+
+
+class WhenCalled:
+    def __init__(self, config, camera):
+        pass
+
+    def __call__(self, number):
+        if number < 0:
+            raise InputError("no image")
+        return 1 / number
+
+    method = __call__
+"""
 
 
 @pytest.fixture
@@ -23,9 +45,10 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = write_own_stages(tmp_path)
     (folder / "broken_stages.py").write_text("import a_package_that_is_missing\n")
     (folder / "wrong_stages.py").write_text("raise ValueError('two\\nlines')\n")
+    (folder / "raising_stages.py").write_text(RAISING)
     monkeypatch.syspath_prepend(folder)
     yield folder
-    for name in (MODULE, "broken_stages", "wrong_stages"):
+    for name in (MODULE, "broken_stages", "wrong_stages", "raising_stages"):
         sys.modules.pop(name, None)
 
 
@@ -52,6 +75,7 @@ def test_class_gets_configuration_and_camera(own: Path) -> None:
         (f"{MODULE}:Corner:Same", "has no attribute Corner:Same"),
         (f"{MODULE}:number", "is a int, which cannot be called; name a class, or a function that returns the stage"),
         (f"{MODULE}:one_argument", "does not accept two arguments, config and camera (too many positional arguments)"),
+        ("raising_stages:AtStart", "cannot be made (RuntimeError: no licence); correct it"),
         (f"{MODULE}:nothing", "returned a NoneType, which cannot be called; return the stage"),
     ],
 )
@@ -60,6 +84,20 @@ def test_mistake_is_one_sentence_with_the_key(own: Path, path: str, message: str
         make_stage("odometry", path, Config(), CAMERA)
     assert str(caught.value).startswith(f"stages.odometry={path}: ")
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_error_of_a_stage_names_the_stage(own: Path) -> None:
+    stage = make_stage("segment", "raising_stages:WhenCalled", Config(), CAMERA)
+    for call in (stage, stage.method):
+        with pytest.raises(StageError) as caught:
+            call(0)
+        assert str(caught.value) == (
+            "stages.segment=raising_stages:WhenCalled failed with ZeroDivisionError: division by zero"
+        )
+        assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    assert stage(2) == stage.method(2) == 0.5
+    with pytest.raises(InputError, match=r"^no image$"):
+        stage(-1)
 
 
 def test_reading_and_writing_a_configuration_imports_nothing(own: Path, tmp_path: Path) -> None:

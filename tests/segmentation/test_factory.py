@@ -12,10 +12,11 @@ from helpers.photographs import photograph
 from PIL import Image
 
 from v3d_torch.config import Config, SegmentationConfig
+from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.segmentation import COCO_NAMES, MaskFolder, NoSegmentation, UprightSegmenter, make_segmenter
-from v3d_torch.segmentation.factory import wrap_upright
+from v3d_torch.segmentation.factory import check_network_is_used, wrap_upright
 from v3d_torch.types import RGBDFrame, Segmenter
 
 CAMERA = PinholeCamera(fx=500.0, fy=500.0, cx=299.5, cy=199.5, width=600, height=400)
@@ -33,7 +34,7 @@ def test_make_segmenter_creates_the_configured_source(tmp_path: Path) -> None:
     baseline = make(source="none")
     assert isinstance(baseline, NoSegmentation)
     assert baseline(frame).masks.shape == (0, 400, 600)
-    with pytest.raises(ConfigError, match="the folder of the id images is missing; name it with --masks"):
+    with pytest.raises(ConfigError, match="the folder of the id images is missing; only `run` takes one, with --masks"):
         make(source="masks")
     Image.fromarray(np.zeros((400, 600), dtype=np.uint8)).save(tmp_path / "a.png")
     assert isinstance(make({"masks_dir": tmp_path}, source="masks"), MaskFolder)
@@ -44,6 +45,14 @@ def test_options_of_another_source_are_rejected(tmp_path: Path) -> None:
         make({"weights": Path("a.onnx")}, source="none")
     with pytest.raises(ConfigError, match=r"--masks ids: not used with .*=yolo; remove it, or add --segmenter masks"):
         make({"masks_dir": Path("ids")})
+
+
+def test_option_of_the_network_is_rejected_with_another_segmenter() -> None:
+    check_network_is_used("--model yolo11n-seg", Config())
+    with pytest.raises(ConfigError, match=r"^--model m: not used with segmentation\.source=none; remove it, or add --"):
+        check_network_is_used("--model m", load_config(overrides="segmentation.source=none"))
+    with pytest.raises(ConfigError, match=r"^--model m: not used with stages\.segment=lab:Own; remove one of them$"):
+        check_network_is_used("--model m", load_config(overrides="stages.segment=lab:Own"))
 
 
 def test_only_a_configured_network_is_kept_upright() -> None:

@@ -265,7 +265,7 @@ def test_configured_segmenter_takes_the_place_of_the_network(own: None) -> None:
     config = load_config(overrides=[f"stages.segment={MODULE}:Corner"])
     slam = V3DSLAM(CAMERA, config=config)
     (found,) = slam(FRAMES[0]).objects
-    assert found.label == 0 and type(slam.segment).__name__ == "Corner"
+    assert found.label == 0 and slam.segment.__class__.__name__ == "Corner"
     assert V3DSLAM(CAMERA, segment, config).segment is segment  # an argument has priority
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from v3d_torch.batch.plan import check_configs
 from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
@@ -88,9 +89,11 @@ def run_ablation_study(
             study was interrupted, or if a run failed. The results of the other runs are written.
     """
     console = wide_console()
+    variant_configs = {variant: load_config(_find_variant(variant), overrides) for variant in variants}
+    check_configs(variant_configs.values())
     configs = {
-        (variant, seed): load_config(_find_variant(variant), [*overrides, f"seed={seed}"])
-        for variant in variants
+        (variant, seed): config.model_copy(update={"seed": seed})
+        for variant, config in variant_configs.items()
         for seed in range(seeds)
     }
     sequences = open_sequences(names, data_root, console)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from v3d_torch.batch.job import Job, single_threaded
@@ -13,6 +13,7 @@ from v3d_torch.datasets.locate import data_root_of
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import ConfigError
 from v3d_torch.io.paths import expand_user, folder_name
+from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import import_stage
 from v3d_torch.segmentation import make_instance_source
 
@@ -37,6 +38,18 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
             raise ConfigError(f"{name}: another configuration is also named {path.stem}; rename the file")
     configs = {label: load_config(path) for label, path in paths.items()}
     return {label: single_threaded(config) for label, config in configs.items()} if one_thread else configs
+
+
+def check_configs(configs: Iterable[Config]) -> None:
+    """Check that configurations set no seed, which the batch sets, and need no inputs of a single run.
+
+    Raises:
+        ConfigError: If a configuration sets another seed than the default, or localises the camera in a map.
+    """
+    for config in configs:
+        check_map_is_given(config)
+        if config.seed != Config().seed:
+            raise ConfigError(f"seed={config.seed}: batch and ablate set the seeds 0, 1, ...; use --seeds")
 
 
 def prepare_stages(configs: Mapping[str, Config]) -> None:

@@ -9,7 +9,7 @@ from rich.console import Console, RenderableType
 
 from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.job import Job
-from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
+from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.runner import check_resume, run_missing_jobs
 from v3d_torch.batch.wide_console import wide_console
@@ -60,6 +60,7 @@ def run_reproduction(
     one_thread = (workers or 1) > 1
     table_configs = load_configs(config_names, one_thread=one_thread)
     configs = load_configs([*config_names, *(ablation.VARIANTS if study else ())], one_thread=one_thread)
+    check_configs(configs.values())
     opened, missing, reason = _open_paper_sequences(data_root, download, console)
     if missing:
         advice = describe_missing(missing, data_folder(data_root), reason)

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.executor import Executor, JobFinished, JobRepeated
-from v3d_torch.batch.plan import load_configs, plan_jobs, prepare_stages
+from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_executor import RayExecutor
@@ -46,6 +46,7 @@ def run_batch(
     check_resume(resume, out)
     console = wide_console()
     configs = load_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
+    check_configs(configs.values())
     names = matching_sequences(patterns, data_root)
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
     opened = open_sequences(names, data_root, console, skip_broken=skip_broken)

@@ -66,7 +66,7 @@ def main(
         with interrupts_between_frames(source) as interrupted:
             if static:
                 frames, failure = record_static(
-                    source, out, load_config(find_config(config or FULL)), interrupted, console
+                    source, out, load_config(find_config(FULL if config is None else config)), interrupted, console
                 )
             else:
                 frames, failure = record_all(source, out, interrupted, console), None

@@ -18,9 +18,9 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
+from v3d_torch.runs.system import check_map_is_given, make_system
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
-from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
 
@@ -77,12 +77,14 @@ def record_static(
         Number of frames, and the reason why the recording ended early; None if it did not, or if the user ended it.
 
     Raises:
+        ConfigError: If the configuration does not map, or its segmenter cannot be made.
         WeightsError: If the weights of the network are not available.
         OutputError: If the folder is not empty, or the poses cannot be written.
     """
+    check_map_is_given(config)
     set_num_threads(config.threads)
     torch.manual_seed(config.seed)
-    slam = V3DSLAM(source.camera, make_segmenter(config, source.camera), config)
+    slam = make_system(source.camera, make_segmenter(config, source.camera), config)
     pipeline = Pipeline(source, slam, evaluate_masks=False)
     compile_kernels(console)
     total = len(source) if isinstance(source, Sized) else None

@@ -85,23 +85,26 @@ def main(
     with quick_imports():
         from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
         from v3d_torch.runs.request import RunRequest
+        from v3d_torch.segmentation.factory import check_network_is_used
 
     if seq is None and resume is None:
         raise typer.BadParameter("give a sequence, or a run to resume (--resume)", param_hint="--seq")
-    segmenter = segmenter or ("masks" if masks is not None else None)
-    overrides = list(set_ or [])
-    overrides += [f"segmentation.source={segmenter}"] if segmenter is not None else []
-    overrides += [f"segmentation.model={model}"] if model is not None else []
-    overrides += [f"seed={seed}"] if seed is not None else []
-    overrides += ["dense_map.mesh.enabled=true"] if mesh else []
-    overrides += ["occupancy.enabled=true"] if occupancy else []
-    overrides += ["mapping.enabled=false"] if localise else []
-    overrides += ["prefetch=false"] if serial else []
-    choice, display = ConfigChoice(config, tuple(overrides)), Display(viz, rerun, bag, profile)
+    options = {f"--masks {masks}": "segmentation.source=masks"} if masks is not None and segmenter is None else {}
+    options |= {f"--segmenter {segmenter}": f"segmentation.source={segmenter}"} if segmenter is not None else {}
+    options |= {f"--model {model}": f"segmentation.model={model}"} if model is not None else {}
+    options |= {f"--seed {seed}": f"seed={seed}"} if seed is not None else {}
+    options |= {"--mesh": "dense_map.mesh.enabled=true"} if mesh else {}
+    options |= {"--occupancy": "occupancy.enabled=true"} if occupancy else {}
+    options |= {"--localise": "mapping.enabled=false"} if localise else {}
+    options |= {"--serial": "prefetch=false"} if serial else {}
+    choice, display = ConfigChoice(config, tuple(set_ or ()), options), Display(viz, rerun, bag, profile)
     with exit_on_error():
+        loaded = choice.load()
+        if model is not None:
+            check_network_is_used(f"--model {model}", loaded)
         request = RunRequest(
             seq=seq or "",
-            config=choice.load(),
+            config=loaded,
             data_root=_text(data_root),
             camera=camera,
             rgb_topic=rgb_topic,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sized
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sized
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -34,6 +35,7 @@ from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import check_unlocked, make_result_folder
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.segmentation import MaskFolder, make_segmenter
 from v3d_torch.viz.viewer import make_viewer
@@ -46,24 +48,42 @@ class ConfigChoice:
     Attributes:
         name: Name or file of a configuration; None for the default.
         overrides: Values to set, such as ``objects.voting.distance_threshold=0.05``.
+        options: Values to set by the options that stand for them, as they are typed: ``seed=3`` by ``--seed 3``.
     """
 
     name: str | None
     overrides: tuple[str, ...]
+    options: Mapping[str, str] = field(default_factory=dict)
 
     def load(self) -> Config:
         """Load the configuration.
 
         Raises:
-            ConfigError: If the name, a key or a value is not valid.
+            ConfigError: If the name, a key or a value is not valid, or if an option and an override set the same key to
+                different values.
         """
-        return load_config(find_config(self.name or FULL), self.overrides)
+        config = load_config(find_config(FULL if self.name is None else self.name), self.overrides)
+        for option, override in self.options.items():
+            changed = override_config(config, [override])
+            key = override.partition("=")[0]
+            if changed != config and (other := next(filter(partial(_sets, key), self.overrides), None)) is not None:
+                raise ConfigError(f"{option}: conflicts with --set {other}; remove one of them")
+            config = changed
+        return config
 
     def conflict(self, config: Config) -> str | None:
-        """Return the first option that would change a configuration; None if there is none."""
+        """Return the first option that would change a configuration, as it is typed; None if there is none."""
         if self.name is not None and self.load() != config:
             return f"--config {self.name}"
-        return next((override for override in self.overrides if override_config(config, [override]) != config), None)
+        given = {**{f"--set {override}": override for override in self.overrides}, **self.options}
+        return next(
+            (option for option, override in given.items() if override_config(config, [override]) != config), None
+        )
+
+
+def _sets(key: str, override: str) -> bool:
+    """Check whether an override sets the value of a key."""
+    return override.partition("=")[0].strip() == key
 
 
 @dataclass(frozen=True)
@@ -110,8 +130,7 @@ def start_run(request: RunRequest, out: Path | None, display: Display) -> None:
     Raises:
         V3DError: If an input is not valid, or the run ended early; its results so far are written.
     """
-    if request.load_map is None and not request.config.mapping.enabled:
-        raise ConfigError("mapping.enabled=false: there is no map to localise in; pass one with --load-map")
+    check_map_is_given(request.config, request.load_map)
     _run(request, out, None, display)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,9 @@ from v3d_torch.io.text import read_text, replace_odd_spaces
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""
+
+_MIN_SIMILARITY = 0.5
+"""Minimum similarity of an unknown key and the one that is suggested: others have no more in common than any words."""
 
 _LEADING_ZERO = re.compile(r"[-+]?0\d+")
 """Integer that is octal in YAML if all its digits are, and decimal otherwise: 010 is 8, and so is 008."""
@@ -52,7 +55,8 @@ def find_config(name: StrPath) -> Path:
         if (path := expand_user(name)).is_file():
             return path
     raise ConfigError(
-        f"{name}: is neither the name of a configuration ({', '.join(CONFIGS)}) nor a YAML file; check name or path"
+        f"{str(name) or repr('')}: is neither the name of a configuration ({', '.join(CONFIGS)}) nor a YAML file; check"
+        " name or path"
     )
 
 
@@ -90,7 +94,7 @@ def dump_config(config: Config) -> str:
 
 
 def _validate(tree: Mapping[str, Any], source: str) -> Config:
-    _reject_unknown_keys(tree, Config, source)
+    _check_tree(tree, Config, source)
     try:
         config = Config.model_validate(tree)
     except ValidationError as error:
@@ -145,11 +149,28 @@ def _reject_extreme_numbers(section: Section, source: str, prefix: str = "") -> 
                 )
 
 
-def _reject_unknown_keys(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
+def _check_tree(tree: Mapping[Any, Any], section: type[Section], source: str, prefix: str = "") -> None:
+    """Reject unknown keys, and values for which pydantic has no good message or that it converts without one."""
     for key, value in tree.items():
         field = section.model_fields.get(str(key))
         if field is None:
-            near = difflib.get_close_matches(str(key), section.model_fields, n=1, cutoff=0.0)[0]
-            raise ConfigError(f"{source}: unknown key {prefix}{key}; did you mean {prefix}{near}?")
-        if isinstance(value, Mapping) and isinstance(field.annotation, type) and issubclass(field.annotation, Section):
-            _reject_unknown_keys(value, field.annotation, source, f"{prefix}{key}.")
+            raise ConfigError(f"{source}: unknown key {prefix}{key}; {_advice(str(key), section, prefix)}")
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
+            if isinstance(value, Mapping):
+                _check_tree(value, field.annotation, source, f"{prefix}{key}.")
+            continue
+        values = value if isinstance(value, Sequence) else (value,)
+        if type(field.default) in (int, float, tuple) and any(isinstance(each, bool) for each in values):
+            raise ConfigError(f"{source}: {prefix}{key}: input should be a number, got {value!r}")
+        if isinstance(field.default, tuple) and isinstance(value, int | float):
+            raise ConfigError(f"{source}: {prefix}{key}: input should be a list such as [{value}], got {value}")
+
+
+def _advice(key: str, section: type[Section], prefix: str) -> str:
+    """Return what to write in place of an unknown key of a section."""
+    *sections, leaf = key.split(".")
+    if sections and sections[0] in section.model_fields:  # the notation of --set in a file
+        return f"write nested sections, {''.join(f'{name}: {{' for name in sections)}{leaf}: ...{'}' * len(sections)}"
+    if near := difflib.get_close_matches(key.lower(), section.model_fields, n=1, cutoff=_MIN_SIMILARITY):
+        return f"did you mean {prefix}{near[0]}?"
+    return f"choose from {', '.join(section.model_fields)}"

@@ -73,7 +73,7 @@ class CloudConfig(Section):
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points, metres: two standard deviations of the depth of a Kinect are 0.1 m there, as large as
     the motion to detect."""
-    voxel_size: float = Field(0.02, gt=0)
+    voxel_size: float = Field(0.02, ge=0.001)
     """Side of a voxel, metres (authors' code)."""
     eps: float = Field(0.08, gt=0)
     """Radius of DBSCAN, metres: four voxels bridge the depth steps of a Kinect at 4 m, but not a person and the wall
@@ -143,7 +143,7 @@ class FreeSpaceConfig(Section):
     tolerance: float = Field(0.01, gt=0)
     """Depth tolerance divided by the squared depth, 1/m: seven standard deviations of the depth of a structured-light
     camera."""
-    min_tolerance: float = Field(0.04, gt=0)
+    min_tolerance: float = Field(0.04, ge=0.001)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
     depth_sync_error: float = Field(0.02, ge=0, le=1)
     """Maximum time between colour and depth of a frame, seconds: TUM associates up to this difference, and reading half
@@ -322,7 +322,8 @@ class MappingConfig(Section):
     last keyframe, is lower (ORB-SLAM2 for RGB-D), and if it adds `tracking.min_inliers` landmarks."""
     min_tracked: int = Field(100, gt=0)
     """A frame becomes a keyframe if it tracks fewer landmarks, adds `tracking.min_inliers` landmarks, and is at least
-    the fourth after the last keyframe."""
+    the fourth after the last keyframe. A frame with fewer static features with depth does not start a map: keep
+    it well below `features.count`."""
     map_by_odometry_after: float = Field(0.5, ge=0)
     """Time since the camera was last tracked in the map after which keyframes are created with the pose of the
     odometry, seconds. Odometry drifts, and usually the camera is tracked in the map again earlier."""
@@ -364,7 +365,7 @@ class MeshConfig(Section):
 
     enabled: bool = False
     """True to write a mesh."""
-    voxel_size: float = Field(0.02, gt=0)
+    voxel_size: float = Field(0.02, ge=0.005)
     """Side of a voxel, metres: the pixels used lie 1.5 cm apart at 4 m, where the depth error is 2 cm."""
     truncation: float = Field(0.08, gt=0)
     """Truncation distance of the signed distance function, metres: three times the combined error of poses and of
@@ -378,7 +379,7 @@ class DenseMapConfig(Section):
     """Every n-th row and column of a keyframe is used: points are 8 mm apart at 2 m, less than a voxel."""
     max_depth: float = Field(4.0, gt=0)
     """Maximum depth of points, metres; the noise of farther points would blur the map."""
-    voxel_size: float = Field(0.01, gt=0)
+    voxel_size: float = Field(0.01, ge=0.001)
     """Side of a voxel, metres: nearly twice the standard deviation of the depth of a Kinect at 2 m."""
     mesh: MeshConfig = MeshConfig()
 

@@ -38,6 +38,12 @@ class Outcome:
         return list(self.metrics.get("warnings", ()))
 
     @property
+    def diagnosis(self) -> str | None:
+        """Cause of incomplete results, such as a camera that was not found in any frame; None if there is none."""
+        diagnosis: str | None = self.metrics.get("diagnosis")
+        return diagnosis
+
+    @property
     def difference(self) -> str | None:
         """Description of the difference to the sequence of the benchmark with this name; None if there is none."""
         difference: str | None = self.metrics.get("difference")
@@ -52,7 +58,7 @@ class Outcome:
 
     def __str__(self) -> str:
         ate = self.get_metric("ate.rmse")
-        score = f"ATE {ate:.4f} m" if ate is not None else "no ground truth, not scored"
+        score = f"ATE {ate:.4f} m" if ate is not None else self.diagnosis or "no ground truth, not scored"
         if self.difference is not None:
             score += f" ({self.difference})"
         if skipped := self.get_metric("skipped"):

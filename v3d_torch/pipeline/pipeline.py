@@ -18,7 +18,7 @@ from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
 from v3d_torch.datasets.readable_frames import ReadableFrames
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import InputError, V3DError
+from v3d_torch.errors import InputError, StageError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.live.live_slam import LiveSLAM
@@ -124,6 +124,9 @@ class Pipeline:
                     record.seconds, self.between_frames = previous_seconds + self._stopwatch.seconds, True
                     if on_frame is not None:
                         on_frame(frame, result)
+        except StageError as error:  # the log has the traceback of the stage
+            _LOG.exception("the run failed")
+            record.failure = str(error)
         except V3DError as error:
             record.failure = str(error)
         except Exception as error:  # keep the results so far after an error of the program

@@ -17,8 +17,8 @@ from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.pipeline import FrameCallback, Pipeline
+from v3d_torch.runs.system import check_map_is_given, make_system
 from v3d_torch.runtime.process import set_num_threads
-from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Segmenter
 
 _MAX_RUNS = 4
@@ -55,13 +55,15 @@ def calibrate_sequence(
 
     Raises:
         InputError: If a frame cannot be read.
+        ConfigError: If the configuration does not map, or as `make_segmenter` raises it.
     """
+    check_map_is_given(config)
     set_num_threads(config.threads)
     given = camera = sequence.camera
     previous: Calibration | None = None
     for number in range(1, _MAX_RUNS + 1):
         torch.manual_seed(config.seed)
-        pipeline = Pipeline(sequence, V3DSLAM(camera, make_segmenter(camera), config), evaluate_masks=False)
+        pipeline = Pipeline(sequence, make_system(camera, make_segmenter(camera), config), evaluate_masks=False)
         record = pipeline(on_run(number, len(sequence)))
         if record.failure is not None:
             raise InputError(record.failure)

@@ -11,6 +11,7 @@ from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.types import RGBDFrame
 
 _SAMPLES = 5
 """Number of frames that are examined."""
@@ -78,9 +79,21 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
             f"images of {sequence.camera.width}x{sequence.camera.height} pixels have too few features; use images of at"
             f" least {_MIN_IMAGE_SIZE} rows and columns"
         )
+    if isinstance(sequence, RGBDSequence):
+        most = max(_count_features(pipeline, frame) for frame in frames)
+        if most < (needed := pipeline.slam.config.mapping.min_tracked):
+            return (
+                f"at most {most} features of an image have depth, and a map starts with mapping.min_tracked={needed};"
+                " lower it, raise features.count, or record it again with more texture in view"
+            )
     if len(pipeline.record.dynamics):
         return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
+
+
+def _count_features(pipeline: Pipeline, frame: RGBDFrame) -> int:
+    """Count the features of a frame that have depth, also those on masked objects."""
+    return int((pipeline.slam.extract_features(frame).features.depth > 0).sum())
 
 
 def _cause_of_missing_scores(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:

@@ -35,9 +35,11 @@ MAY_BE_NAN = frozenset(
         "NewlyOccupied.appeared",  # if it is not known
         "ObjectState.position",  # of an object that never had a clean cloud
         "TrackedObject.chamfer",  # if it was not measured
+        "describe_appearance",  # of an instance with too few pixels
     }
 )
-"""Fields in which NaN has a meaning, which their class documents."""
+"""Fields, and results of stages, in which NaN has a meaning, which the class of the field or the protocol of the stage
+documents."""
 
 MAY_BE_INFINITE = frozenset({"Readout.information"})  # of a readout that the camera states
 """Fields in which infinity has a meaning, which their class documents."""
@@ -98,7 +100,7 @@ class CheckedStage(CheckingProxy):
     """
 
     def _check(self, result: Any, *args: Any) -> None:
-        check_finite(self._name, result)
+        check_finite(self._name, result, nan=self._name in MAY_BE_NAN)
 
     def __getattr__(self, name: str) -> Any:
         value = super().__getattr__(name)

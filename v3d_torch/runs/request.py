@@ -94,7 +94,7 @@ class RunRequest:
         """
         options = self._options()
         for name, value in other.absolute()._options().items():
-            if name not in CHANGEABLE and value not in (None, False) and value != options[name]:
+            if name not in CHANGEABLE and value is not None and value is not False and value != options[name]:
                 return f"--{name.replace('_', '-')}"
         return None
 

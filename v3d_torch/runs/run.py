@@ -25,12 +25,11 @@ from v3d_torch.pipeline import FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
-from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
+from v3d_torch.runs.system import make_system
 from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
-from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, Segmenter
 
 _LOG = logging.getLogger(__name__)
@@ -78,8 +77,7 @@ class Run:
         write_request(folder, request)
         set_num_threads(config.threads)
         torch.manual_seed(config.seed)
-        system = CheckedSLAM if config.check_numerics else V3DSLAM
-        slam = system(sequence.camera, segment, config, None if known_map is None else known_map.map)
+        slam = make_system(sequence.camera, segment, config, None if known_map is None else known_map.map)
         self._folder = folder
         self._request = request
         self._is_resumed = checkpoint is not None

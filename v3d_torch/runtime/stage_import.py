@@ -13,9 +13,10 @@ from collections.abc import Callable
 from typing import Any
 
 from v3d_torch.config import Config, StagesConfig
-from v3d_torch.errors import ConfigError
+from v3d_torch.errors import ConfigError, StageError, V3DError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.runtime.input_checks import describe_type
+from v3d_torch.runtime.stage_proxy import StageProxy
 
 
 def import_stage(name: str, path: str) -> Callable[..., Any]:
@@ -36,10 +37,9 @@ def import_stage(name: str, path: str) -> Callable[..., Any]:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # an import runs any code
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise ConfigError(
-            f"{key}: the module {module_name} cannot be imported ({reason}); correct it, install it, or add its folder"
-            " to PYTHONPATH"
+            f"{key}: the module {module_name} cannot be imported ({_describe(error)}); correct it, install it, or"
+            " add its folder to PYTHONPATH"
         ) from error
     try:
         stage = operator.attrgetter(attribute)(module)
@@ -65,8 +65,9 @@ def make_stage(name: str, path: str, config: Config, camera: PinholeCamera) -> A
         camera: Second argument.
 
     Raises:
-        ConfigError: If it cannot be imported, does not accept the two arguments, or returns something that cannot be
-            called.
+        ConfigError: If it cannot be imported, does not accept the two arguments, raises an error, or returns something
+            that cannot be called.
+        StageError: When the stage or a method is called, if it raises another error than a `V3DError`.
     """
     key, make = f"stages.{name}={path}", import_stage(name, path)
     try:
@@ -75,10 +76,38 @@ def make_stage(name: str, path: str, config: Config, camera: PinholeCamera) -> A
         pass
     except TypeError as error:
         raise ConfigError(f"{key}: does not accept two arguments, config and camera ({error})") from error
-    stage = make(config, camera)
+    try:
+        stage = make(config, camera)
+    except Exception as error:  # a constructor runs any code
+        raise ConfigError(f"{key}: cannot be made ({_describe(error)}); correct it") from error
     if not callable(stage):
         raise ConfigError(f"{key}: returned {describe_type(stage)}, which cannot be called; return the stage")
-    return stage
+    return ImportedStage(stage, key)
+
+
+class ImportedStage(StageProxy):
+    """Proxy of an imported stage whose errors name the stage.
+
+    Args:
+        stage: Stage.
+        name: Its key and import path.
+
+    Raises:
+        StageError: When the stage or a method is called, if it raises another error than a `V3DError`.
+    """
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the stage."""
+        try:
+            return self._stage(*args, **kwargs)
+        except V3DError:
+            raise
+        except Exception as error:  # a stage runs any code
+            raise StageError(f"{self._name} failed with {_describe(error)}") from error
+
+    def __getattr__(self, name: str) -> Any:
+        value = super().__getattr__(name)
+        return ImportedStage(value, self._name) if callable(value) else value
 
 
 def first_not_given(stored: StagesConfig, given: StagesConfig) -> str | None:
@@ -88,3 +117,8 @@ def first_not_given(stored: StagesConfig, given: StagesConfig) -> str | None:
         Its key and import path, such as ``stages.segment=my_package:MySegmenter``; None if there is none.
     """
     return next((f"stages.{name}={path}" for name, path in stored.paths.items() if given.paths.get(name) != path), None)
+
+
+def _describe(error: Exception) -> str:
+    """Return type and message of an error, on one line."""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"

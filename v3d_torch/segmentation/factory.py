@@ -48,9 +48,37 @@ def make_segmenter(
     others = [f"--weights {weights}"] if weights is not None else []
     others += [f"--masks {masks_dir}"] if masks_dir is not None else []
     others += [f"segmentation.source={source}"] if source != "yolo" else []
-    if others:
-        raise ConfigError(f"{others[0]}: not used with stages.segment={path}; remove one of them")
+    for other in others:
+        _check_no_stage(other, config)
     return make_stage("segment", path, config, camera)
+
+
+def check_network_is_used(option: str, config: Config) -> None:
+    """Check that an option of the network has an effect.
+
+    Args:
+        option: Option as it is typed, such as ``--model yolo11n-seg``.
+        config: Configuration of the run.
+
+    Raises:
+        ConfigError: If the segmenter of the configuration is not the network.
+    """
+    _check_no_stage(option, config)
+    _check_source(option, "yolo", config.segmentation)
+
+
+def _check_no_stage(option: str, config: Config) -> None:
+    """Raise `ConfigError` if the segmenter is given by its import path, and has no such option."""
+    if (path := config.stages.segment) is not None:
+        raise ConfigError(f"{option}: not used with stages.segment={path}; remove one of them")
+
+
+def _check_source(option: str, source: str, config: SegmentationConfig) -> None:
+    """Raise `ConfigError` if the source of instances is not the one to which an option belongs."""
+    if config.source != source:
+        raise ConfigError(
+            f"{option}: not used with segmentation.source={config.source}; remove it, or add --segmenter {source}"
+        )
 
 
 def wrap_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
@@ -74,15 +102,14 @@ def make_instance_source(
         InputError: If the folder contains no masks.
     """
     for option, value, source in (("weights", weights, "yolo"), ("masks", masks_dir, "masks")):
-        if value is not None and config.source != source:
-            raise ConfigError(
-                f"--{option} {value}: not used with segmentation.source={config.source}; remove it, or add"
-                f" --segmenter {source}"
-            )
+        if value is not None:
+            _check_source(f"--{option} {value}", source, config)
     if config.source == "none":
         return NoSegmentation()
     if config.source == "masks":
         if masks_dir is None:
-            raise ConfigError("segmentation.source=masks: the folder of the id images is missing; name it with --masks")
+            raise ConfigError(
+                "segmentation.source=masks: the folder of the id images is missing; only `run` takes one, with --masks"
+            )
         return MaskFolder(masks_dir)
     return YOLOSegmenter(config, weights)

@@ -125,7 +125,11 @@ CASES = [
         config("objects: {voting: {vote_treshold: 3}}\n"),
         Fails("{seq}/own.yaml: unknown key objects.voting.vote_treshold; did you mean objects.voting.vote_threshold?"),
     ),
-    Case("key that is a number", config("1: 2\n"), Fails("{seq}/own.yaml: unknown key 1; did you mean tracking?")),
+    Case(
+        "key that is a number",
+        config("1: 2\n"),
+        Fails("{seq}/own.yaml: unknown key 1; choose from seed, threads, ..., stages"),
+    ),
     Case("key that is a list", config("? [a, b]\n: 2\n"), Fails(INVALID_YAML)),
     Case(
         "value instead of a section",
@@ -203,7 +207,7 @@ CASES = [
     Case(
         "--set with a key with two dots",
         setting("features..count=3"),
-        Fails("--set: unknown key features.; did you mean features.scale?"),
+        Fails("--set: unknown key features.; choose from count, levels, scale, cell, max_depth"),
     ),
     Case(
         "--set with a key below a value",
@@ -282,8 +286,13 @@ CASES = [
     ),
     Case(
         "--set with a tiny voxel size",
-        setting("dense_map.voxel_size=1e-30"),
-        Fails("--set: dense_map.voxel_size: input should be between 1e-09 and 1e+09, got 1e-30"),
+        setting("dense_map.voxel_size=0.0001"),
+        Fails("--set: dense_map.voxel_size: input should be greater than or equal to 0.001, got 0.0001"),
+    ),
+    Case(
+        "--set with a tiny number",
+        setting("depth.sigma=1e-30"),
+        Fails("--set: depth.sigma: input should be between 1e-09 and 1e+09, got 1e-30"),
     ),
     Case(
         "negative --seed",

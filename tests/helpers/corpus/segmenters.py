@@ -153,7 +153,7 @@ CASES = [
     Case(
         "no folder of masks",
         replace_options("--segmenter", "masks"),
-        Fails("segmentation.source=masks: the folder of the id images is missing; name it with --masks"),
+        Fails("segmentation.source=masks: the folder of the id images is missing; only `run` takes one, with --masks"),
     ),
     Case(
         "a missing folder of id images",
