@@ -33,6 +33,7 @@ from v3d_torch.occupancy.up_estimator import UpEstimator
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
+from v3d_torch.runtime.inference_mode import mode_to_update
 from v3d_torch.runtime.input_checks import check_next
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
@@ -203,6 +204,10 @@ class V3DSLAM(FramePreprocessor):
             InputError: If the frame is not later than the previous one, or the depth of the first frame is not in
                 metres.
         """
+        with mode_to_update(self._updated_tensors()):
+            return self._track(preprocessed)
+
+    def _track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         frame, depth = preprocessed.frame, preprocessed.extraction.depth
         check_next(frame, self.poses.stamp)
         self.timer.add(preprocessed.times)
@@ -258,12 +263,9 @@ class V3DSLAM(FramePreprocessor):
         if result is None:
             return
         self.timer.add(result.times)
-        with self.timer("mapping"):
+        with self.timer("mapping"), mode_to_update(self._updated_tensors()):
             self._apply_world_correction(self.back_end.apply(result))
-            previous = None if self._previous is None else self._previous.landmarks
-            self.map.compact(
-                [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous]
-            )
+            self.map.compact(self._landmarks_outside_of_map())
 
     def advance_predictions(self) -> PosePrediction | None:
         """Append the prediction for the frame after the next `PREFETCHED_FRAMES`, and return it.
@@ -316,6 +318,16 @@ class V3DSLAM(FramePreprocessor):
     def _components_with_state(self) -> dict[str, Stateful]:
         components = {name: getattr(self, name) for name in _STATEFUL}
         return {name: require_state(name, each) for name, each in components.items() if each is not None}
+
+    def _updated_tensors(self) -> list[Tensor]:
+        """Oldest and newest tensors that are updated in place: if any was made in inference mode, one of these was."""
+        newest = [keyframe.landmarks for keyframe in self.map.keyframes[-1:]]
+        return [self.map.landmarks["point"], *newest, *self._landmarks_outside_of_map()]
+
+    def _landmarks_outside_of_map(self) -> list[Tensor]:
+        """Landmark IDs stored outside of the map, -1 for none, int64, updated in place when the map is compacted."""
+        previous = None if self._previous is None else self._previous.landmarks
+        return [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous]
 
     def _compensate(self, features: Features, preprocessed: PreprocessedFrame, velocity: Tensor) -> Features:
         """Move features to where they would be without rolling shutter and depth delay, see `TimeCompensation`."""
