@@ -38,7 +38,7 @@ from v3d_torch.runtime.input_checks import check_next
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.segmentation.segmenter import restore_segmenter
+from v3d_torch.segmentation.segmenter import innermost_segmenter, restore_segmenter
 from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES, FramePreprocessor
 from v3d_torch.stages.protocols import (
@@ -242,7 +242,7 @@ class V3DSLAM(FramePreprocessor):
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
-            has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
+            has_objects = self._proposes_objects or not isinstance(innermost_segmenter(self.segment), NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
