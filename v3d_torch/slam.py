@@ -38,7 +38,7 @@ from v3d_torch.runtime.input_checks import check_next
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.segmentation.segmenter import innermost_segmenter, restore_segmenter
+from v3d_torch.segmentation.segmenter import innermost_segmenter, restore_segmenter, segmenter_state_of
 from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES, FramePreprocessor
 from v3d_torch.stages.protocols import (
@@ -142,7 +142,7 @@ class V3DSLAM(FramePreprocessor):
         self.up_estimator = UpEstimator()
         self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
-        self._segmenter_state: dict[str, Any] | None = None
+        self._segmenter_state = segmenter_state_of(self.segment)
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
 
     @property
