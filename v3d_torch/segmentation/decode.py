@@ -157,7 +157,7 @@ def _inside(boxes: Tensor) -> list[list[int]]:
 @torch.inference_mode(False)  # the cached matrix can later be used where gradients are required
 def _upsampling_matrix(cells: int, pixels: int) -> Tensor:
     """Linear interpolation from cells to pixels of the same extent, as a matrix, shape (pixels, cells)."""
-    return functional.interpolate(torch.eye(cells)[None], pixels, mode="linear")[0].T
+    return functional.interpolate(torch.eye(cells, dtype=torch.float32)[None], pixels, mode="linear")[0].T
 
 
 @cache
