@@ -79,7 +79,8 @@ class V3DSLAM(FramePreprocessor):
         segment: Segmenter; None to create the one named in the configuration. An `UprightSegmenter` is replaced by a
             new one around the same network, because it accumulates votes over the frames of one system.
         config: Configuration of all stages; None for the default.
-        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map.
+        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map. The
+            system extends this map itself, not a copy: load it again for another run.
 
     Attributes:
         camera: Camera of all frames.
