@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from helpers.default_dtype import default_dtype
+from helpers.differences import differences
 from helpers.walk_run import CAMERA as WALK_CAMERA
 from helpers.walk_run import CONFIG as WALK_CONFIG
 from helpers.walk_run import Walk, segment_red
@@ -25,7 +28,7 @@ from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
-from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
+from v3d_torch.segmentation import NoSegmentation, UprightSegmenter, make_segmenter
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.types import FramePose, TrackingStatus
 
@@ -65,6 +68,28 @@ def test_moving_regions_become_objects_without_a_network(demo: RGBDSequence) -> 
         result = proposing(demo[index])
         assert baseline(demo[index]).objects == []
     assert result.objects and all(each.label == UNLABELLED for each in result.objects)
+
+
+@pytest.mark.parametrize("source", ["yolo", "masks", "none"])
+def test_default_dtype_of_the_program_does_not_change_the_results(
+    source: str, demo: RGBDSequence, tmp_path: Path
+) -> None:
+    """Also in a frame without segmentation, whose instances are those of the frame before."""
+    ids = np.zeros((480, 640), np.uint8)
+    ids[100:300, 200:300] = 1
+    for index in range(2):
+        Image.fromarray(ids).save(tmp_path / f"{float(demo.stamps[index]):.6f}.png")
+    config = load_config(None, (f"segmentation.source={source}", "segmentation.interval=2"))
+
+    def track() -> list[FrameResult]:
+        segment = make_segmenter(config, demo.camera, masks_dir=tmp_path if source == "masks" else None)
+        slam = V3DSLAM(demo.camera, segment, config)
+        return [slam(demo[index]) for index in range(2)]
+
+    expected = track()
+    with default_dtype(torch.float64):
+        found = track()
+    assert list(differences(expected, found, "results", {})) == []
 
 
 def test_frames_from_opencv_arrays_give_the_same_poses(demo: RGBDSequence) -> None:

@@ -34,11 +34,12 @@ from v3d_torch.occupancy.up_estimator import UpEstimator
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.odometry.odometry import CameraMotion, Odometry, TrackedFrame
 from v3d_torch.odometry.time_compensation import TimeCompensation
+from v3d_torch.runtime.inference_mode import mode_to_update
 from v3d_torch.runtime.input_checks import check_next
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.segmentation.segmenter import restore_segmenter
+from v3d_torch.segmentation.segmenter import innermost_segmenter, restore_segmenter, segmenter_state_of
 from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES, FramePreprocessor
 from v3d_torch.stages.protocols import (
@@ -76,9 +77,11 @@ class V3DSLAM(FramePreprocessor):
 
     Args:
         camera: Camera of all frames.
-        segment: Segmenter; None to create the one named in the configuration.
+        segment: Segmenter; None to create the one named in the configuration. An `UprightSegmenter` is replaced by a
+            new one around the same network, because it accumulates votes over the frames of one system.
         config: Configuration of all stages; None for the default.
-        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map.
+        known_map: Map of an earlier run in which the camera is localised, see `load_map`; None to start a new map. The
+            system extends this map itself, not a copy: load it again for another run.
 
     Attributes:
         camera: Camera of all frames.
@@ -141,7 +144,7 @@ class V3DSLAM(FramePreprocessor):
         self.up_estimator = UpEstimator()
         self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
-        self._segmenter_state: dict[str, Any] | None = None
+        self._segmenter_state = segmenter_state_of(self.segment)
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
 
     @property
@@ -204,6 +207,10 @@ class V3DSLAM(FramePreprocessor):
             InputError: If the frame is not later than the previous one, or the depth of the first frame is not in
                 metres.
         """
+        with mode_to_update(self._updated_tensors()):
+            return self._track(preprocessed)
+
+    def _track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         frame, depth = preprocessed.frame, preprocessed.extraction.depth
         check_next(frame, self.poses.stamp)
         self.timer.add(preprocessed.times)
@@ -238,7 +245,7 @@ class V3DSLAM(FramePreprocessor):
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
-            has_objects = self._proposes_objects or not isinstance(self.segment, NoSegmentation)
+            has_objects = self._proposes_objects or not isinstance(innermost_segmenter(self.segment), NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
@@ -259,13 +266,9 @@ class V3DSLAM(FramePreprocessor):
         if result is None:
             return
         self.timer.add(result.times)
-        with self.timer("mapping"):
+        with self.timer("mapping"), mode_to_update(self._updated_tensors()):
             self._apply_world_correction(self.back_end.apply(result))
-            previous = None if self._previous is None else self._previous.landmarks
-            compact_landmarks(
-                self.map,
-                [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous],
-            )
+            compact_landmarks(self.map, self._landmarks_outside_of_map())
 
     def advance_predictions(self) -> PosePrediction | None:
         """Append the prediction for the frame after the next `PREFETCHED_FRAMES`, and return it.
@@ -318,6 +321,16 @@ class V3DSLAM(FramePreprocessor):
     def _components_with_state(self) -> dict[str, Stateful]:
         components = {name: getattr(self, name) for name in _STATEFUL}
         return {name: require_state(name, each) for name, each in components.items() if each is not None}
+
+    def _updated_tensors(self) -> list[Tensor]:
+        """Oldest and newest tensors that are updated in place: if any was made in inference mode, one of these was."""
+        newest = [keyframe.landmarks for keyframe in self.map.keyframes[-1:]]
+        return [self.map.landmarks["point"], *newest, *self._landmarks_outside_of_map()]
+
+    def _landmarks_outside_of_map(self) -> list[Tensor]:
+        """Landmark IDs stored outside of the map, -1 for none, int64, updated in place when the map is compacted."""
+        previous = None if self._previous is None else self._previous.landmarks
+        return [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous]
 
     def _compensate(self, features: Features, preprocessed: PreprocessedFrame, velocity: Tensor) -> Features:
         """Move features to where they would be without rolling shutter and depth delay, see `TimeCompensation`."""

@@ -181,12 +181,18 @@ class Instances:
     @staticmethod
     def empty(height: int, width: int) -> Instances:
         """No instances in an image of ``height`` x ``width`` pixels."""
-        return Instances(
-            masks=torch.zeros(0, height, width, dtype=torch.bool),
-            labels=torch.zeros(0, dtype=torch.int64),
-            scores=torch.zeros(0),
-            boxes=torch.zeros(0, 4),
-        )
+        return Instances.from_masks(torch.zeros(0, height, width, dtype=torch.bool), torch.zeros(0, dtype=torch.int64))
+
+    @staticmethod
+    def from_masks(masks: Tensor, labels: Tensor) -> Instances:
+        """Instances with the score 0 and empty boxes.
+
+        Args:
+            masks: Pixels of each instance, bool, shape :math:`(N, H, W)`.
+            labels: COCO class index, int64, shape :math:`(N,)`.
+        """
+        boxes = torch.zeros(len(masks), 4, dtype=torch.float32)
+        return Instances(masks, labels, scores=boxes.new_zeros(len(masks)), boxes=boxes)
 
 
 Segmenter = Callable[[RGBDFrame], Instances]

@@ -148,6 +148,39 @@ def test_pipeline_in_inference_mode_equals_calls_outside_of_it(demo: RGBDSequenc
     assert torch.equal(slam.map.landmarks["point"], pipeline.slam.map.landmarks["point"])
 
 
+@pytest.mark.parametrize("inside", [range(FRAMES), range(FRAMES // 2), range(0, FRAMES, 2), range(-1, 0)])
+def test_frames_inside_and_outside_of_inference_mode_equal_those_outside(inside: range, demo: RGBDSequence) -> None:
+    """The range -1 makes only the system, and all others only frames, in inference mode."""
+    config = make_config(in_background=False)
+    expected = V3DSLAM(demo.camera, config=config)
+    with torch.inference_mode(-1 in inside):
+        slam = V3DSLAM(demo.camera, config=config)
+    for index in range(FRAMES):
+        expected(demo[index])
+        with torch.inference_mode(index in inside):
+            slam(demo[index])
+    for each in (expected, slam):
+        each.flush()
+    assert torch.equal(slam.poses.trajectory().T_wc, expected.poses.trajectory().T_wc)
+    assert torch.equal(slam.map.landmarks["point"], expected.map.landmarks["point"])
+    assert expected.poses.T_cw.is_inference() is False
+
+
+@pytest.mark.parametrize("copy_inside", [True, False])
+def test_state_from_inference_mode_is_loaded_outside_of_it(copy_inside: bool, demo: RGBDSequence) -> None:
+    config = make_config(in_background=False)
+    slam, loaded = (V3DSLAM(demo.camera, config=config) for _ in range(2))
+    for index in range(FRAMES // 2):
+        with torch.inference_mode(not copy_inside):
+            slam(demo[index])
+    with torch.inference_mode(copy_inside):
+        loaded.load_state_dict(copy.deepcopy(slam.state_dict()))
+    for each in (slam, loaded):
+        each(demo[FRAMES // 2])
+        each.flush()
+    assert torch.equal(slam.poses.trajectory().T_wc, loaded.poses.trajectory().T_wc)
+
+
 @pytest.mark.parametrize("in_background", [True, False])
 def test_back_end_that_loads_a_state_gives_the_pending_result(in_background: bool, demo: RGBDSequence) -> None:
     config = make_config(in_background=in_background)

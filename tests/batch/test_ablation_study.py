@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import torch
+from helpers.differences import differences
+from helpers.walk_run import CAMERA, CONFIG, Walk
 
 from v3d_torch.batch.ablation_study import CachedSegmenter
+from v3d_torch.config.loading import override_config
+from v3d_torch.segmentation import NoSegmentation
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame
 
 
@@ -55,3 +60,13 @@ def test_rotated_image_is_segmented_anew() -> None:
             == turned.shape[1:]
         )
     assert segmented == [(5, 13), (13, 5), (5, 13), (13, 5)]
+
+
+def test_baseline_without_masks_is_recognised_inside_of_the_cache() -> None:
+    """Nothing is checked against earlier views if there are no objects."""
+    walk, config = Walk(), override_config(CONFIG, ["segmentation.source=none"])
+    plain, cached = (V3DSLAM(CAMERA, each, config) for each in (NoSegmentation(), CachedSegmenter(NoSegmentation())))
+    for index in range(3):
+        plain(walk[index]), cached(walk[index])
+    states = (slam.free_space_check.state_dict() for slam in (plain, cached))
+    assert list(differences(*states, "views", {})) == []

@@ -9,6 +9,7 @@ import torch
 from helpers.board_room import CAMERA, make_views
 from torch import Tensor
 
+from v3d_torch.batch.ablation_study import CachedSegmenter
 from v3d_torch.calibration.colour_order import check_colour_order
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.segmentation import NoSegmentation
@@ -35,6 +36,13 @@ def test_network_that_recognises_more_after_the_exchange_gives_a_warning() -> No
     assert warning.endswith("the colour images seem to be BGR instead of RGB")
     network = ScoreNetwork(-preference)
     assert check_colour_order(views, network) == [] and network.calls == 4  # two images, given and exchanged
+
+
+def test_network_inside_of_all_wrappers_is_compared() -> None:
+    """As in an ablation study."""
+    network = ScoreNetwork(4.0)
+    check_colour_order(make_views(6)[0], UprightSegmenter(CachedSegmenter(network)))
+    assert network.calls > 0
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -7,18 +7,21 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.walk_run import CONFIG, Walk, interrupt_after, make_pipeline
+from helpers.walk_run import CONFIG, Walk, interrupt_after, make_pipeline, segment_red
 
 from v3d_torch.errors import OutputError
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.objects.frame_objects import MotionState
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs import checkpoint as checkpoint_module
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import FileSizes, describe_change, read_checkpoint, write_checkpoint
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.run import Run
+from v3d_torch.segmentation import UprightSegmenter
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.segmentation.segmenter import segmenter_state_of
-from v3d_torch.types import TrackingStatus
+from v3d_torch.types import RGBDFrame, TrackingStatus
 
 STOPS = (0, 1, 7, 8, 19, 22, 31, 32, 33, 45, 53)
 
@@ -75,6 +78,30 @@ def test_run_resumed_many_times_equals_an_uninterrupted_run(uninterrupted: Pipel
     # The database of loop closing is rebuilt and gives the same candidates.
     query = expected.map.keyframes[3].features.descriptors
     assert slam.loop_closer._database.query(query, 9) == expected.loop_closer._database.query(query, 9)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_run_whose_results_cannot_be_written_when_interrupted_resumes_exactly(
+    tmp_path: Path,
+) -> None:
+    folder, request = tmp_path / "out", RunRequest("walk", CONFIG)
+    whole, again = tmp_path / "whole", tmp_path / "again"
+    for each in (folder, whole, again):
+        each.mkdir()
+    Run(request, Walk(), UprightSegmenter(segment_red), whole)(lambda *_: None)
+    run = Run(request, Walk(), UprightSegmenter(segment_red), folder)
+
+    def interrupt(frame: RGBDFrame, result: FrameResult) -> None:
+        if frame.index >= 8 and run.pipeline.slam.back_end.keyframe is not None:
+            (folder / "map.ply").mkdir()
+            raise KeyboardInterrupt
+
+    with pytest.raises(OutputError, match=r"map\.ply"):
+        run(interrupt)
+    checkpoint = read_checkpoint(folder)
+    Run(request, Walk(), UprightSegmenter(segment_red), again, checkpoint=checkpoint)(lambda *_: None)
+    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
+        assert (again / name).read_bytes() == (whole / name).read_bytes(), name
 
 
 def test_next_checkpoint_reads_the_sizes_of_new_files_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
+from v3d_torch.segmentation.segmenter import segmenter_state_of
 
 
 def test_loaded_system_equals_the_saved_one(tmp_path: Path) -> None:
@@ -46,6 +48,24 @@ def test_loaded_system_gives_the_same_next_results(saved_after: int, tmp_path: P
         assert list(differences(slam(walk[index]), loaded(walk[index]), f"frame {index}", {})) == []
     slam.flush(), loaded.flush()
     assert list(differences(slam, loaded, "slam", {})) == []
+
+
+def test_state_from_before_the_first_frame_also_restores_the_segmenter() -> None:
+    walk, slam = Walk(), V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG)
+    start, votes = copy.deepcopy(slam.state_dict()), segmenter_state_of(slam.segment)
+    for index in range(3):
+        slam(walk[index])
+    slam.load_state_dict(start)
+    assert list(differences(votes, segmenter_state_of(slam.segment), "votes", {})) == []
+
+
+def test_segmenter_of_one_system_does_not_change_the_results_of_another() -> None:
+    walk, first, alone = Walk(), *(V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG) for _ in range(2))
+    first(walk[0])
+    second = V3DSLAM(CAMERA, first.segment, CONFIG)
+    for index in range(3):
+        second(walk[index]), alone(walk[index])
+    assert list(differences(segmenter_state_of(alone.segment), segmenter_state_of(second.segment), "votes", {})) == []
 
 
 @pytest.mark.parametrize("stage", ["mapper", "classify_motion", "free_space_check"])

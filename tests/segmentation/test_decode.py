@@ -46,6 +46,13 @@ def test_decode_applies_threshold_and_suppression_and_sorts_by_score() -> None:
     assert instances.masks.shape == (3, HEIGHT, WIDTH)
 
 
+def test_instances_inside_autocast_equal_those_outside() -> None:
+    output = raw_output(torch.tensor([[8.0, 12.0, 20.0, 40.0]]), [0], [0.9])
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = decode_whole(*output)
+    assert torch.equal(inside.masks, decode_whole(*output).masks)
+
+
 def test_convention_box_contains_pixels_from_left_to_before_right() -> None:
     instances = decode_whole(*raw_output(torch.tensor([[8.0, 12.0, 20.0, 40.0]]), [0], [0.9]))
     expected = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)

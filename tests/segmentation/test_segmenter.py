@@ -7,7 +7,13 @@ from helpers.tilted_frames import IDENTITY, Network, make_frame
 from torch import nn
 
 from v3d_torch.runtime.stateful import Stateful
-from v3d_torch.segmentation.segmenter import PoseAwareSegmenter, restore_segmenter, segment_frame, segmenter_state_of
+from v3d_torch.segmentation.segmenter import (
+    PoseAwareSegmenter,
+    innermost_segmenter,
+    restore_segmenter,
+    segment_frame,
+    segmenter_state_of,
+)
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.types import Instances, RGBDFrame
 
@@ -27,6 +33,12 @@ def test_protocols_and_helper_functions_apply_to_upright_segmenters_only() -> No
     restore_segmenter(other, state)
     restore_segmenter(network, state)
     assert other.state_dict()["calls"] == 1 and torch.equal(other.state_dict()["up"], state["up"])
+
+
+def test_source_of_instances_is_found_inside_of_wrappers() -> None:
+    network = Network()
+    assert innermost_segmenter(network) is network
+    assert innermost_segmenter(UprightSegmenter(UprightSegmenter(network))) is network
 
 
 def test_weights_of_a_torch_module_are_not_its_state() -> None:

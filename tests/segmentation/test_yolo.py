@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 import torch
+from helpers.default_dtype import default_dtype
 from helpers.photographs import photograph
 from onnx import TensorProto, helper
 from PIL import Image, ImageDraw
@@ -144,6 +145,16 @@ def test_network_is_exported_once_for_each_size(tmp_path: Path, monkeypatch: pyt
     assert exported_path("yolo26n-seg", weights, 64, 96) == first
     assert first.stat().st_mtime_ns == stamp
     assert exported_path("yolo26n-seg", weights, 96, 64) != first
+
+
+def test_exported_network_does_not_depend_on_the_default_dtype(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights, written = find_weights("yolo26n-seg"), []
+    for dtype in (torch.float32, torch.float64):
+        monkeypatch.setenv("V3D_CACHE", str(tmp_path / str(dtype)))
+        with default_dtype(dtype):
+            written.append(exported_path("yolo26n-seg", weights, 64, 96).read_bytes())
+            assert torch.get_default_dtype() == dtype
+    assert written[0] == written[1]
 
 
 def test_damaged_files_of_a_network_in_the_cache_are_written_again(

@@ -55,17 +55,20 @@ class CachedSegmenter:
 
     Args:
         segment: Segmenter to cache.
+
+    Attributes:
+        wrapped: The segmenter to cache.
     """
 
     def __init__(self, segment: Segmenter) -> None:
-        self._segment = segment
+        self.wrapped = segment
         self._cache: dict[tuple[int, int], Instances] = {}
 
     def __call__(self, frame: RGBDFrame) -> Instances:
         """Return the instances of a frame. The cache key is index and image, because the image may be rotated."""
         key = (frame.index, hash(frame.image.numpy().tobytes()))
         if key not in self._cache:
-            instances = self._segment(frame)
+            instances = self.wrapped(frame)
             packed = np.packbits(instances.masks.numpy(), axis=-1)  # eight pixels per byte, to save memory
             self._cache[key] = replace(instances, masks=torch.from_numpy(packed))
         cached = self._cache[key]

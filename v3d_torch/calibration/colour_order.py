@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.mapping.static_views import StaticViews
-from v3d_torch.segmentation.upright import UprightSegmenter
+from v3d_torch.segmentation.segmenter import innermost_segmenter
 from v3d_torch.segmentation.yolo import YOLOSegmenter
 from v3d_torch.types import Segmenter
 
@@ -39,7 +39,7 @@ def check_colour_order(views: StaticViews, segment: Segmenter) -> list[str]:
     Returns:
         A list with one sentence that states the likely cause, or an empty list.
     """
-    network = segment.segment if isinstance(segment, UprightSegmenter) else segment
+    network = innermost_segmenter(segment)
     if not isinstance(network, YOLOSegmenter) or len(views) < _FIRST_IMAGES:
         return []
     images = [view.colour for view in views]

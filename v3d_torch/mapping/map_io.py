@@ -44,7 +44,7 @@ class StoredMap:
     """Map of an earlier run.
 
     Attributes:
-        map: Keyframes, with frame -1, and landmarks.
+        map: Keyframes, with frame -1, and landmarks. The run to which it is given changes it.
         views: Static views of the keyframes, for dense reconstruction; can be empty.
     """
 

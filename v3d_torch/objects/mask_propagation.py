@@ -53,7 +53,7 @@ def propagate_instances(
     if not masks:
         return Instances.empty(*view.depth.shape[-2:])
     labels = torch.tensor([track.label for track in masks])
-    return Instances(torch.stack([*masks.values()]), labels, torch.zeros(len(masks)), torch.zeros(len(masks), 4))
+    return Instances.from_masks(torch.stack([*masks.values()]), labels)
 
 
 def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float, *, step: int = 1) -> Tensor:

@@ -52,4 +52,4 @@ def unlabelled_instances(
     if len(large) == 0:
         return Instances.empty(height, width)
     masks = upsample_nearest(region == large[:, None, None], step, (height, width))
-    return Instances(masks, torch.full((len(large),), UNLABELLED), torch.zeros(len(large)), torch.zeros(len(large), 4))
+    return Instances.from_masks(masks, torch.full((len(large),), UNLABELLED))

@@ -112,7 +112,7 @@ class Run:
 
         Raises:
             OutputError: If the results cannot be written; the message also has the other failures of the run. A
-                checkpoint is saved, if it can be written.
+                checkpoint is saved, if it can be written; if the run ended early, its last checkpoint stays.
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
@@ -138,11 +138,12 @@ class Run:
                 self._save_map(self._map_file, is_whole=is_whole)
             self._restore_folder()
             evaluation = write_results(self._folder, self.pipeline, self._request)
-        except OutputError as error:  # the run is resumed from here when there is space again
+        except OutputError as error:  # the run is resumed when there is space again
             record.add_failure(str(error))
             with suppress(OutputError):
                 prepare_intermediate_results(self._folder, self.pipeline)()
-            self._autosave.end()
+            if is_whole:  # else the checkpoint from before `flush` stays, which would change the next frames
+                self._autosave.end()
             raise OutputError(record.failure) from error
         self._autosave.discard()
         if problem := record.failure or record.diagnosis:

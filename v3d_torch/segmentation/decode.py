@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.kernels import mask_upsampling as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.segmentation.coco import LIVING
@@ -98,6 +99,7 @@ def _assemble_masks_compiled(
     return masks
 
 
+@without_autocast
 @compiled_by(_assemble_masks_compiled)
 def assemble_masks(
     coefficients: Tensor, prototypes: Tensor, boxes: Tensor, window: Window, *, first: tuple[int, int] = (0, 0)
@@ -155,7 +157,7 @@ def _inside(boxes: Tensor) -> list[list[int]]:
 @torch.inference_mode(False)  # the cached matrix can later be used where gradients are required
 def _upsampling_matrix(cells: int, pixels: int) -> Tensor:
     """Linear interpolation from cells to pixels of the same extent, as a matrix, shape (pixels, cells)."""
-    return functional.interpolate(torch.eye(cells)[None], pixels, mode="linear")[0].T
+    return functional.interpolate(torch.eye(cells, dtype=torch.float32)[None], pixels, mode="linear")[0].T
 
 
 @cache

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import cast
 
@@ -51,8 +52,24 @@ def exported_path(model: str, weights: Path, height: int, width: int) -> Path:
     """
     sha256 = REGISTRY[model].sha256
     target = cache_dir() / "networks" / f"{model}-{sha256[:12]}-{height}x{width}-v{_VERSION}.onnx"
-    derive([target], lambda draft: export(build(model, read_pt_weights(weights, sha256)), height, width, draft))
+
+    def write(draft: Path) -> None:
+        with _default_float32():
+            export(build(model, read_pt_weights(weights, sha256)), height, width, draft)
+
+    derive([target], write)
     return target
+
+
+@contextmanager
+def _default_float32() -> Iterator[None]:
+    """Set the default dtype of torch, which parameters and constants of an exported network have."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 def build(model: str, tensors: dict[str, Tensor]) -> LayerGraph:

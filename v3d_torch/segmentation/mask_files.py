@@ -113,7 +113,7 @@ class MaskFolder:
         instances = Instances(
             masks=masks,
             labels=labels,
-            scores=torch.ones(len(ids)),
+            scores=torch.ones(len(ids), dtype=torch.float32),
             boxes=_bounding_boxes(masks),
         )
         return instances, ids

@@ -37,6 +37,13 @@ def segment_frame(segmenter: Segmenter, frame: RGBDFrame, T_cw: Tensor | None) -
     return segmenter(frame)
 
 
+def innermost_segmenter(segmenter: Segmenter) -> Segmenter:
+    """Return the source of the instances: the segmenter inside of wrappers, which have it as attribute ``wrapped``."""
+    while (wrapped := getattr(segmenter, "wrapped", None)) is not None:
+        segmenter = wrapped
+    return segmenter
+
+
 def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
     """Return the state of a segmenter; None if it has no state.
 

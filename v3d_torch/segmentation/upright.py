@@ -52,18 +52,18 @@ class UprightSegmenter:
         segment: Segmenter of frames of any size.
 
     Attributes:
-        segment: The segmenter of frames of any size.
+        wrapped: The segmenter of frames of any size.
     """
 
     def __init__(self, segment: Segmenter) -> None:
-        self.segment = segment
+        self.wrapped = segment
         self._calls = 0
         # Sum of the votes, in the world frame; replaced by each vote, never changed in place.
         self._up = torch.tensor([0.0, -_PRIOR_WEIGHT, 0.0], dtype=torch.float64)
 
     def __call__(self, frame: RGBDFrame) -> Instances:
         """Segment a frame without a pose: upright if its gravity was measured, else in its own orientation."""
-        return self.segment(frame) if frame.gravity is None else self._segment_rotated(frame, _turns(-frame.gravity))
+        return self.wrapped(frame) if frame.gravity is None else self._segment_rotated(frame, _turns(-frame.gravity))
 
     def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
         """Segment a frame in upright orientation.
@@ -121,9 +121,9 @@ class UprightSegmenter:
     def _segment_rotated(self, frame: RGBDFrame, turns: int) -> Instances:
         """Segment a frame after counterclockwise quarter turns; the instances are rotated back."""
         if turns == 0:
-            return self.segment(frame)
+            return self.wrapped(frame)
         image, depth = (torch.rot90(values, turns, dims=(1, 2)).contiguous() for values in (frame.image, frame.depth))
-        instances = self.segment(replace(frame, image=image, depth=depth))
+        instances = self.wrapped(replace(frame, image=image, depth=depth))
         for _ in range(turns):
             instances = _rotate_clockwise(instances)
         return instances

@@ -12,6 +12,7 @@ from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import LABELS
 from v3d_torch.segmentation.segmenter import segment_frame, segmenter_state_of
+from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.stages.protocols import DepthStage, FeatureStage
 from v3d_torch.stages.stage_checks import ReplaceableStages
 from v3d_torch.tracking.motion_model import PosePrediction
@@ -30,7 +31,8 @@ class FramePreprocessor(ReplaceableStages):
 
     Args:
         camera: Camera of all frames.
-        segment: Segmenter; None to create the one named in the configuration.
+        segment: Segmenter; None to create the one named in the configuration. An `UprightSegmenter` is replaced by a
+            new one around the same network, because it accumulates votes over the frames of one system.
         config: Configuration of all stages; None for the default.
 
     Attributes:
@@ -47,6 +49,8 @@ class FramePreprocessor(ReplaceableStages):
         super().__init__()
         self.camera = camera
         self.config = config = config or Config()
+        if segment is not None and segment.__class__ is UprightSegmenter:
+            segment = UprightSegmenter(segment.wrapped)  # its votes belong to one system
         self.segment = segment or make_segmenter(config, camera)
         self.smooth_depth: DepthStage = DepthSmoother(
             config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio

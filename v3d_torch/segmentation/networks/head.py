@@ -130,9 +130,10 @@ def cell_grid(sizes: Sequence[Sequence[int]]) -> tuple[Tensor, Tensor]:
     centres, strides = [], []
     for size, stride in zip(sizes, STRIDES, strict=True):
         height, width = map(int, size)  # Python numbers become constants in the export
-        y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        rows, columns = (torch.arange(count, dtype=torch.float32) + 0.5 for count in (height, width))
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
         centres.append(torch.stack([x, y]).flatten(1))
-        strides.append(torch.full((height * width,), float(stride)))
+        strides.append(torch.full((height * width,), stride, dtype=torch.float32))
     return torch.cat(centres, dim=1), torch.cat(strides)
 
 
