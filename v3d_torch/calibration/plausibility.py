@@ -113,8 +113,9 @@ def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
     if ratio is not None and not 1 / _STEP_TOLERANCE < ratio < _STEP_TOLERANCE:
         error = f"{ratio:.3g} times too large" if ratio > 1 else f"{1 / ratio:.3g} times too small"
         return [
-            f"the steps of the depth images are {ratio:.3g} times those of a Kinect or Xtion, whose field of view the"
-            f" camera has; the depth_scale {camera.depth_scale:g} seems to be {error}"
+            f"the steps of the depth images are {ratio:.3g} times those of a Kinect or Xtion; if the camera, which has"
+            f" their field of view, is one of them, the depth_scale {camera.depth_scale:g} is {error}; other cameras,"
+            " such as stereo cameras, have other steps"
         ]
     low, median, high = (float(depth.quantile(q)) for q in (0.01, 0.5, 0.99))
     if low > _FAR[0] and high > _FAR[1]:

@@ -253,8 +253,6 @@ def _print_summary(
         console.print(profile_table(record))
     for note in evaluation.notes if evaluation is not None else ():
         print_line(console, f"note: {note}")
-    for warning in record.warnings:
-        print_line(console, f"warning: {warning}")
     if record.save_error is not None:
         print_line(console, f"note: no checkpoint was saved, {record.save_error}")
     print_line(console, f"results: {folder}")

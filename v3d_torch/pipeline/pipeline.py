@@ -177,10 +177,10 @@ class Pipeline:
         return point_map
 
     def warn(self, warnings: Iterable[str]) -> None:
-        """Log and record warnings; a resumed run may have recorded them already."""
+        """Log and record warnings that are not recorded yet; a resumed run may have recorded them already."""
         for warning in warnings:
-            _LOG.warning(warning)
             if warning not in self.record.warnings:
+                _LOG.warning(warning)
                 self.record.warnings.append(warning)
 
     def state_dict(self) -> dict[str, Any]:

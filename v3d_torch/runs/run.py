@@ -95,6 +95,8 @@ class Run:
             remove_unfinished(folder)
             self.pipeline.load_state_dict(checkpoint.state)
             _LOG.info("resumed after %d frames", checkpoint.frames)
+            for warning in self.pipeline.record.warnings:
+                _LOG.warning(warning)  # also on the screen, where only the earlier process has shown it
         if known_map is not None and len(known_map.views) == 0:
             self.pipeline.warn([_NO_VIEWS])
         self._autosave = Autosave(folder, self.pipeline, request if save_checkpoints else None)
