@@ -25,8 +25,8 @@ def combine(prior: Readout, slope: float, curvature: float) -> Readout:
 @given(st.floats(0, 0.03), st.floats(0, 0.03), st.floats(1e3, 1e8), st.floats(1e3, 1e8))
 def test_calibration_with_a_quadratic_cost_is_the_weighted_mean(a: float, b: float, prior: float, new: float) -> None:
     calibrated = combine(Readout(a, prior), slope=2 * new * (a - b), curvature=2 * new)
-    assert calibrated.information == pytest.approx(0.8 * prior + 0.1 * new, rel=1e-12)
-    assert calibrated.seconds == pytest.approx((0.8 * prior * a + 0.1 * new * b) / calibrated.information, abs=1e-9)
+    assert calibrated.information == pytest.approx(0.85 * prior + 0.03 * new, rel=1e-12)
+    assert calibrated.seconds == pytest.approx((0.85 * prior * a + 0.03 * new * b) / calibrated.information, abs=1e-9)
 
 
 @pytest.mark.parametrize("curvature", [0.0, -1e6])
@@ -39,7 +39,7 @@ def test_calibration_keeps_a_certain_readout() -> None:
 
 
 def test_calibrated_readout_is_at_most_the_longest_accepted() -> None:
-    calibrated = combine(Readout(0.01, 1.0), slope=-2e6 * 2.99, curvature=2e6)
+    calibrated = combine(Readout(0.01, 0.1), slope=-2e6 * 2.99, curvature=2e6)
     assert calibrated.seconds == pytest.approx(MAX_READOUT, abs=1e-6)
 
 

@@ -21,13 +21,13 @@ from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import REGULARISATION
 from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
-_PRIOR_WEIGHT = 0.9
+_PRIOR_WEIGHT = 0.85
 """Weight of the earlier information: the first bundle adjustments have the least accurate camera motion."""
 
-_INFORMATION_WEIGHT = 0.01
+_INFORMATION_WEIGHT = 0.03
 """Weight of the information from the curvature. Errors of depth and velocity are correlated between observations, and
-successive bundle adjustments share most of these, so the curvature overestimates the information. With this weight the
-standard deviation agrees with the errors on recordings of three seconds."""
+successive bundle adjustments share most of these, so the curvature overestimates the information; 0.03 corresponds to
+standard deviations that are six times larger."""
 
 _MIN_CURVATURE = 1e-6
 """Smallest curvature of a minimum, as a fraction of the curvature without adjustment of poses and points. Where these
