@@ -247,7 +247,7 @@ def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: P
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
 @pytest.mark.usefixtures("undrawn")
-def test_estimated_depth_scale_is_a_warning_in_the_record_and_on_the_screen_also_of_a_resumed_run(moment: Path, tmp_path: Path) -> None:
+def test_estimated_depth_scale_is_recorded_and_shown_once_also_by_a_resumed_run(moment: Path, tmp_path: Path) -> None:
     folder = tmp_path / "seq"
     shutil.copytree(moment, folder)
     lines = (folder / "camera.yaml").read_text().splitlines(keepends=True)
