@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -65,9 +64,10 @@ class ConfigChoice:
         config = load_config(find_config(FULL if self.name is None else self.name), self.overrides)
         for option, override in self.options.items():
             changed = override_config(config, [override])
-            key = override.partition("=")[0]
-            if changed != config and (other := next(filter(partial(_sets, key), self.overrides), None)) is not None:
-                raise ConfigError(f"{option}: conflicts with --set {other}; remove one of them")
+            if changed != config:
+                for other in self.overrides:
+                    if _key(other) == _key(override):
+                        raise ConfigError(f"{option}: conflicts with --set {other}; remove one of them")
             config = changed
         return config
 
@@ -81,9 +81,9 @@ class ConfigChoice:
         )
 
 
-def _sets(key: str, override: str) -> bool:
-    """Check whether an override sets the value of a key."""
-    return override.partition("=")[0].strip() == key
+def _key(override: str) -> str:
+    """Return the key that an override sets."""
+    return override.partition("=")[0].strip()
 
 
 @dataclass(frozen=True)
