@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import kornia_rs
 import numpy as np
+import pytest
 import torch
 from helpers.photographs import photograph
 
@@ -63,13 +64,16 @@ def test_most_features_lie_beside_those_of_kornia_rs() -> None:
         assert (torch.cdist(theirs, ours).amin(dim=1) < 2).to(torch.float64).mean() > 0.5
 
 
-def test_features_of_all_levels_lie_at_the_same_point() -> None:
+@pytest.mark.parametrize(("scale", "first_octave"), [(1, 0), (3, 4)])
+def test_features_of_all_levels_lie_at_the_same_point(scale: int, first_octave: int) -> None:
     """A level's pixel covers a square of the image; its centre is not the corner's pixel times the scale."""
-    image = torch.full((3, 480, 640), 60, dtype=torch.uint8)
+    width, height = 640 * scale, 480 * scale
+    image = torch.full((3, height, width), 60, dtype=torch.uint8)
     image[:, 200:, 300:] = 200  # its corner lies between pixels 299 and 300, and 199 and 200
-    features = ORB(Config().features, CAMERA)(image, torch.ones(1, 480, 640))
+    camera = PinholeCamera(500.0 * scale, 500.0 * scale, (width - 1) / 2, (height - 1) / 2, width, height)
+    features = ORB(Config().features, camera)(image, torch.ones(1, height, width))
     octaves = features.octave.unique()
-    assert len(octaves) >= 6
+    assert len(octaves) >= 6 and octaves[0] == first_octave
     for octave in octaves.tolist():
         # FAST finds corners inside of the bright quarter, at the same distance in pixels of each level.
         inside = (features.uv[features.octave == octave] - torch.tensor([299.5, 199.5])) / 1.2**octave

@@ -224,7 +224,7 @@ class FeaturesConfig(Section):
     count: int = Field(1500, gt=0)
     """Number of features per frame. More than the 1000 of ORB-SLAM2, because masks remove some of them."""
     levels: int = Field(8, gt=0, le=20)
-    """Levels of the scale pyramid (ORB-SLAM2)."""
+    """Levels of the scale pyramid (ORB-SLAM2). The finest has at most 1000 columns, also in images that have more."""
     scale: float = Field(1.2, gt=1)
     """Scale factor between levels (ORB-SLAM2)."""
     cell: int = Field(32, gt=0)
@@ -289,7 +289,7 @@ class TrackingConfig(Section):
     simultaneous nor perfectly registered. It equals ORB-SLAM2's setting: a pixel of disparity at a baseline of 40 pixel
     metres."""
     pixel_sigma: float = Field(1.0, gt=0)
-    """Standard deviation of the position of a feature at level 0, pixels."""
+    """Standard deviation of the position of a feature at octave 0, pixels."""
     min_inliers: int = Field(20, gt=0)
     """Minimum number of landmarks found; with fewer the camera is lost."""
     local_keyframes: int = Field(15, gt=0)

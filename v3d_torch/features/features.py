@@ -134,7 +134,7 @@ def make_measurements(
         inverse_depth: Inverse depth, 1/m, float64, shape :math:`(N,)`; 0 = no measurement.
         octave: Octave of each feature, int64, shape :math:`(N,)`.
         sigma_ratio: See `Features`, float64, shape :math:`(N, 2)`.
-        config: Configuration with the standard deviations of pixels at level 0 and of inverse depth.
+        config: Configuration with the standard deviations of pixels at octave 0 and of inverse depth.
         pyramid: Scale factor between pyramid levels.
     """
     pixel_ratio, depth_ratio = sigma_ratio.unbind(dim=1)

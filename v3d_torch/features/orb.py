@@ -14,7 +14,7 @@ from v3d_torch.features.brightness import brighten
 from v3d_torch.features.corner_selection import select_corners
 from v3d_torch.features.fast import detect_corners
 from v3d_torch.features.features import Features, sample_depth
-from v3d_torch.features.scale_pyramid import ScalePyramid
+from v3d_torch.features.scale_pyramid import ScalePyramid, octaves_of_levels
 from v3d_torch.geometry.camera import PinholeCamera
 
 Ints = NDArray[np.int64]
@@ -44,7 +44,9 @@ class ORB:
     def __init__(self, config: FeaturesConfig, camera: PinholeCamera) -> None:
         self._camera = camera
         self._max_depth = config.max_depth
-        self._pyramid = ScalePyramid(camera.width, camera.height, config.levels, config.scale, brief.MARGIN)
+        octaves = octaves_of_levels(config, camera.width)
+        self._first_octave = octaves[0]
+        self._pyramid = ScalePyramid(camera.width, camera.height, octaves, config.scale, brief.MARGIN)
         # A geometric series, so that the density is the same on all levels.
         shares = config.scale ** -np.arange(len(self._pyramid.sizes), dtype=np.float64)
         self._counts = np.round(config.count * shares / shares.sum()).astype(int).tolist()
@@ -68,15 +70,15 @@ class ORB:
         smoothed = kornia_rs.imgproc.gaussian_blur(canvas[..., None], _SMOOTHING_SIZE, _SMOOTHING_SIGMA)[..., 0]
         descriptors = brief.describe(*map(torch.from_numpy, (canvas, smoothed, corners)))
         # Pixel centres lie at integers, so the image borders lie at half-integers.
-        sizes = np.array(self._pyramid.sizes)
+        ratio = (self._camera.width, self._camera.height) / np.array(self._pyramid.sizes)
         corners[:, 1] -= self._pyramid.tops[level]
-        position = torch.from_numpy((corners + 0.5) * (sizes[0] / sizes)[level] - 0.5)
+        position = torch.from_numpy((corners + 0.5) * ratio[level] - 0.5)
         pixel = position.round().to(torch.int64)
         return Features(
             uv=self._camera.undistort(position),
             pixel=pixel,
             depth=sample_depth(pixel, depth, self._max_depth),
-            octave=torch.from_numpy(level),
+            octave=torch.from_numpy(level + self._first_octave),
             descriptors=descriptors,
         )
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.config import FeaturesConfig, TrackingConfig
 from v3d_torch.features.features import Features
 from v3d_torch.features.projection_search import match_by_projection
+from v3d_torch.features.scale_pyramid import octaves_of_levels
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import landmark_projection as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -33,7 +34,7 @@ class LocalMap:
         points: Positions, world frame, metres, float64, shape :math:`(L, 3)`.
         directions: Unit vectors from the camera that first observed a landmark to the landmark, world frame, float64,
             shape :math:`(L, 3)`.
-        reference_distance: Distance at which a landmark appears on level 0 of the scale pyramid, metres, float64,
+        reference_distance: Distance at which a landmark appears at octave 0, metres, float64,
             shape :math:`(L,)`.
         descriptors: 256-bit descriptors, uint8, shape :math:`(L, 32)`.
     """
@@ -67,7 +68,8 @@ def _project_compiled(self: ProjectionMatcher, T_cw: Tensor, local_map: LocalMap
     if any(column.dtype != torch.float64 or column.requires_grad for column in columns):
         return NotImplemented
     pose, points, directions, distances, K, bounds = map(to_array, (*columns, self._camera.K, self._bounds))
-    projected = kernels.project(pose, points, directions, distances, K, bounds, math.log(self._scale), self._levels)
+    octaves = self._octaves[0], self._octaves[-1]
+    projected = kernels.project(pose, points, directions, distances, K, bounds, math.log(self._scale), *octaves)
     return ProjectedLandmarks(*map(torch.from_numpy, projected))
 
 
@@ -83,13 +85,13 @@ class ProjectionMatcher:
     def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._scale = pyramid.scale
-        self._levels = pyramid.levels
+        self._octaves = octaves_of_levels(pyramid, camera.width)
         self._camera = camera
         # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower bounds are inclusive.
         margin = _LEVEL_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
-        lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, -margin]
-        upper = [math.inf, u_max, v_max, math.inf, pyramid.levels - 1 + margin]
+        lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, self._octaves[0] - margin]
+        upper = [math.inf, u_max, v_max, math.inf, self._octaves[-1] + margin]
         self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
 
     def __call__(
@@ -101,7 +103,7 @@ class ProjectionMatcher:
             features: Features of the frame.
             projection: Landmarks projected into the frame, see `project`.
             local_map: The local map that was projected.
-            radius: Search radius, pixels at level 0; it grows with the level.
+            radius: Search radius, pixels at octave 0; it grows with the level.
 
         Returns:
             Pairs (row of ``local_map``, feature), int64, shape :math:`(K, 2)`. Each landmark and each feature occurs at
@@ -143,5 +145,5 @@ class ProjectionMatcher:
         lower, upper = self._bounds[..., None]
         rows = torch.nonzero(((predicted >= lower) & (predicted < upper)).all(dim=0))[:, 0]
         z, u, v, _, level = predicted.index_select(1, rows)
-        octave = level.round().clamp(0, self._levels - 1).to(torch.int64)
+        octave = level.round().clamp(self._octaves[0], self._octaves[-1]).to(torch.int64)
         return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, octave)

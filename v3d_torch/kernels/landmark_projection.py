@@ -14,10 +14,10 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 
-@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8, i8)")
+@kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8, i8, i8)")
 def project(
     T_cw: Array, points: Array, directions: Array, reference_distance: Array, K: Array, bounds: Array,
-    log_scale: float, levels: int,
+    log_scale: float, first_octave: int, last_octave: int,
 ) -> tuple[Indices, Array, Array, Indices]:  # fmt: skip
     """Project landmarks into a camera, and select the V landmarks in view.
 
@@ -25,11 +25,12 @@ def project(
         T_cw: World-to-camera pose, (4, 4).
         points: Landmarks, world frame, (L, 3).
         directions: Unit viewing directions of the first observations, world frame, (L, 3).
-        reference_distance: Distances at which the landmarks appear on pyramid level 0, metres, (L,).
+        reference_distance: Distances at which the landmarks appear at octave 0, metres, (L,).
         K: Camera matrix, (3, 3).
         bounds: Lower (inclusive) and upper bound of (z, u, v, cosine, level), (2, 5).
         log_scale: Logarithm of the scale factor between pyramid levels.
-        levels: Number of pyramid levels.
+        first_octave: Octave of the finest pyramid level.
+        last_octave: Octave of the coarsest pyramid level.
 
     Returns:
         Indices of the landmarks in view, (V,), their pixels, (V, 2), depth, metres, (V,), and octaves, (V,).
@@ -51,6 +52,6 @@ def project(
         level = math.log(reference_distance[i] / distance) / log_scale
         if lower[3] <= cosine < upper[3] and lower[4] <= level < upper[4]:
             rows[count], uv[count, 0], uv[count, 1], depth[count] = i, u, v, z
-            level_of[count] = min(max(int(np.rint(level)), 0), levels - 1)
+            level_of[count] = min(max(int(np.rint(level)), first_octave), last_octave)
             count += 1
     return rows[:count], uv[:count], depth[:count], level_of[:count]

@@ -21,7 +21,7 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.optim.reprojection import chi_square, reprojection_residuals
 
 _SEARCH_RADIUS = 3.0
-"""Search radius of the projection matching, pixels at pyramid level 0 (ORB-SLAM2); small, because both poses are
+"""Search radius of the projection matching, pixels at octave 0 (ORB-SLAM2); small, because both poses are
 known."""
 
 

@@ -25,7 +25,7 @@ class MapTables:
             - ``point``: Position, world frame, metres, float64, :math:`(3,)`.
             - ``direction``: Unit viewing direction from the keyframe that created the landmark, world frame,
               float64, :math:`(3,)`.
-            - ``reference_distance``: Distance at which the landmark appears on pyramid level 0, metres, float64.
+            - ``reference_distance``: Distance at which the landmark appears at octave 0, metres, float64.
             - ``descriptor``: ORB descriptor, uint8, :math:`(32,)`.
             - ``keyframe``: Index of the keyframe that created the landmark, int64. The landmark moves with it.
             - ``found``: Number of frames that matched the landmark, int64.

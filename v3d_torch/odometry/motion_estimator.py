@@ -13,16 +13,18 @@ from v3d_torch.config import FeaturesConfig, OdometryConfig
 from v3d_torch.features.features import Features, select_evenly
 from v3d_torch.features.matching import match_descriptors
 from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
+from v3d_torch.features.scale_pyramid import octaves_of_levels
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_log
 from v3d_torch.types import MIN_INTERVAL
 
 _EPIPOLAR_THRESHOLD = 2.0
-"""Maximum Sampson distance of epipolar inliers, pixels: twice the localisation error of a feature."""
+"""Maximum Sampson distance of epipolar inliers, pixels of the finest level: twice the localisation error of a
+feature."""
 
 _PNP_THRESHOLD = 4.0
-"""Maximum reprojection error of inliers of PnP-RANSAC, pixels. Larger than the epipolar threshold, because the depth
-error of the points adds to the pixel error."""
+"""Maximum reprojection error of inliers of PnP-RANSAC, pixels of the finest level. Larger than the epipolar threshold,
+because the depth error of the points adds to the pixel error."""
 
 _MAX_ROTATION_RATE = 6.3
 """Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
@@ -88,7 +90,7 @@ class MotionEstimator:
 
     Args:
         config: Thresholds of matching and RANSAC.
-        features: Grid over which the features are spread.
+        features: Grid over which the features are spread, and scale pyramid.
         camera: Intrinsics.
         seed: Seed of both RANSACs.
     """
@@ -96,6 +98,7 @@ class MotionEstimator:
     def __init__(self, config: OdometryConfig, features: FeaturesConfig, camera: PinholeCamera, seed: int) -> None:
         self._config = config
         self._cell = features.cell
+        self._pixel = features.scale ** octaves_of_levels(features, camera.width)[0]  # of the finest level
         self._camera = camera
         self._seed = seed
 
@@ -128,7 +131,7 @@ class MotionEstimator:
         epipolar = epipolar_inliers(
             a.uv[pairs[:, 0]],
             b.uv[pairs[:, 1]],
-            threshold=_EPIPOLAR_THRESHOLD,
+            threshold=_EPIPOLAR_THRESHOLD * self._pixel,
             iterations=config.iterations,
             seed=self._seed,
         )
@@ -140,7 +143,7 @@ class MotionEstimator:
             b.uv[pairs[:, 1]],
             self._camera.K,
             initial_guess,
-            threshold=_PNP_THRESHOLD,
+            threshold=_PNP_THRESHOLD * self._pixel,
             iterations=config.iterations,
             seed=self._seed,
         )
