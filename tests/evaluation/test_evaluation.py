@@ -64,6 +64,22 @@ def test_estimate_of_other_shape_has_no_depth_unit_note(seed: int) -> None:
     assert "times as large" not in " ".join(evaluate(Trajectory(stamps, one), Trajectory(stamps, other)).notes)
 
 
+def test_lost_poses_do_not_indicate_depth_unit() -> None:
+    """The camera is lost in the second half of its path, where the estimate stays at the last known pose."""
+    groundtruth = random_walk(60, seed=18)
+    groundtruth.T_wc[:, :3, 3] = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
+    estimate = Trajectory(groundtruth.stamps, groundtruth.T_wc.clone())
+    estimate.T_wc[30:, :3, 3] = estimate.T_wc[29, :3, 3]
+    is_located = torch.arange(60) < 30
+    assert "times as large" in " ".join(evaluate(groundtruth, estimate).notes)
+    evaluation = evaluate(groundtruth, estimate, is_located=is_located)
+    assert "times as large" not in " ".join(evaluation.notes) and evaluation.ate.rmse > 0.1
+    estimate.T_wc[:, :3, 3] /= 5
+    assert "is 5 times as large" in " ".join(evaluate(groundtruth, estimate, is_located=is_located).notes)
+    two = torch.arange(60) < 2
+    assert "times as large" not in " ".join(evaluate(groundtruth, estimate, is_located=two).notes)
+
+
 def test_placeholder_orientations_give_no_rpe() -> None:
     groundtruth = random_walk(60, seed=13)
     T_wc = groundtruth.T_wc.clone()

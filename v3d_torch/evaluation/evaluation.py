@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
@@ -68,6 +69,7 @@ def evaluate(
     max_time_difference: float = MAX_TIME_DIFFERENCE,
     rpe_delta: float = 1.0,
     frames: int | None = None,
+    is_located: Tensor | None = None,
 ) -> Evaluation:
     """Evaluate a trajectory by the protocol of the TUM RGB-D benchmark, which the paper's tables follow.
 
@@ -81,6 +83,8 @@ def evaluate(
         max_time_difference: Maximum difference between the timestamps of a pair, seconds.
         rpe_delta: Time over which the RPE measures drift, seconds.
         frames: Number of colour-depth pairs of the sequence, for the coverage.
+        is_located: True for each pose of the estimate that was measured relative to the map, bool, shape :math:`(N,)`;
+            None if this is not known. The other poses count for the errors, but do not indicate the scale of depth.
 
     Raises:
         InputError: If fewer than three poses can be associated, or if an argument is not a trajectory.
@@ -104,7 +108,7 @@ def evaluate(
     notes = []
     if alignment.source is RotationSource.ORIENTATIONS:
         notes.append("the ground-truth positions do not span a plane: aligned by the mean of the orientations")
-    factor = scale_error(T_gc, T_ec, alignment)
+    factor = _located_scale_error(T_gc, T_ec, None if is_located is None else is_located[matches.estimate], oriented)
     if factor is not None:
         notes.append(f"the ground truth is {factor:.3g} times as large as the estimate: check depth_scale")
     rpe = relative_pose_error(groundtruth, estimate, matches, rpe_delta) if oriented else None
@@ -160,6 +164,15 @@ def has_orientations(trajectory: Trajectory) -> bool:
 
 def _coverage(poses: int, frames: int | None) -> float | None:
     return min(poses / frames, 1.0) if frames else None
+
+
+def _located_scale_error(T_gc: Tensor, T_ec: Tensor, is_located: Tensor | None, oriented: bool) -> float | None:
+    """Compute the scale error of the poses that were measured relative to the map; None if there are too few."""
+    if is_located is not None:
+        T_gc, T_ec = T_gc[is_located], T_ec[is_located]
+    if len(T_gc) < MIN_PAIRS:
+        return None
+    return scale_error(T_gc, T_ec, align(T_gc, T_ec, oriented=oriented))
 
 
 def _suggest(true: float, estimated: float) -> str:
