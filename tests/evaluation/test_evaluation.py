@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource
-from v3d_torch.evaluation.evaluation import absent_scores, format_coverage
+from v3d_torch.evaluation.evaluation import absent_scores, format_coverage, note_too_few_poses
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
 
@@ -144,6 +144,14 @@ def test_coverage_and_json_values() -> None:
     assert values["rpe"]["rot"]["std"] == evaluation.rpe.rot.std
     assert absent_scores(45, 60).keys() == values.keys() and absent_scores(45, 60)["coverage"] == 0.75
     assert values["coverage"] == 0.75 and values["alignment"]["rotation_from"] == "positions"
+
+
+def test_too_few_poses_for_scores_are_noted() -> None:
+    groundtruth = random_walk(60, seed=19)
+    one, two = (note_too_few_poses(groundtruth, poses) for poses in (1, 2))
+    assert one == ("only 1 pose: at least 3 are needed for an ATE",) and two[0].startswith("only 2 poses: at")
+    assert note_too_few_poses(groundtruth, 3) == note_too_few_poses(None, 2) == ()
+    assert absent_scores(1, 1, one)["notes"] == list(one)
 
 
 def test_arguments_that_are_not_trajectories_are_rejected() -> None:

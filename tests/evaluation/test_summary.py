@@ -128,6 +128,8 @@ def test_line_of_a_run_without_scores_tells_why() -> None:
     assert str(Outcome("s", "full", 0, {"ate": None})) == "s, full, seed 0: no ground truth, not scored"
     lost = Outcome("s", "full", 0, {"ate": None, "diagnosis": "s: the camera was not found in any of the 9 frames"})
     assert str(lost) == "s, full, seed 0: s: the camera was not found in any of the 9 frames"
+    short = Outcome("s", "full", 0, {"ate": None, "notes": ["only 2 poses: at least 3 are needed for an ATE"]})
+    assert str(short) == "s, full, seed 0: only 2 poses: at least 3 are needed for an ATE"
 
 
 def test_latex_is_balanced_and_has_same_values() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -129,15 +130,28 @@ def evaluate(
     )
 
 
-def absent_scores(poses: int, frames: int | None) -> dict[str, Any]:
+def note_too_few_poses(groundtruth: Trajectory | None, poses: int) -> tuple[str, ...]:
+    """Return the notes of a trajectory without scores: that it has too few poses to compare with its ground truth.
+
+    Args:
+        groundtruth: Ground-truth poses; None if there are none, without a note.
+        poses: Number of estimated poses.
+    """
+    if groundtruth is None or poses >= MIN_PAIRS:
+        return ()
+    return (f"only {poses} {'pose' if poses == 1 else 'poses'}: at least {MIN_PAIRS} are needed for an ATE",)
+
+
+def absent_scores(poses: int, frames: int | None, notes: Sequence[str] = ()) -> dict[str, Any]:
     """Return the values of `Evaluation.to_dict` for a trajectory that cannot be compared with a ground truth.
 
     Args:
         poses: Number of estimated poses.
         frames: Number of frames of the sequence; None if it is not known.
+        notes: Reasons why there are no scores, one sentence each.
     """
     absent = dict.fromkeys(("ate", "rpe", "alignment"))
-    return {**absent, "pairs": 0, "poses": poses, "coverage": _coverage(poses, frames), "notes": []}
+    return {**absent, "pairs": 0, "poses": poses, "coverage": _coverage(poses, frames), "notes": list(notes)}
 
 
 def format_coverage(coverage: float) -> str:
