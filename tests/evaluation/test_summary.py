@@ -152,6 +152,22 @@ def test_latex_is_balanced_and_has_same_values() -> None:
     assert depth == 0
 
 
+def test_long_latex_tables_break_across_pages() -> None:
+    outcomes = [run for i in range(41) for run in runs(f"room_{i}", "full", 0.1)]
+    short, long = format_latex(outcomes[:40]), format_latex(outcomes)
+    assert "table*" in short and "longtable" not in short
+    assert long.splitlines()[1].startswith("% \\usepackage{longtable}") and "table*" not in long
+    assert long.count("\\begin{longtable}{lr}") == long.count("\\end{longtable}") == 3
+    assert long.count("\\toprule") == long.count("\\midrule") == 6 and long.count("\\bottomrule") == 3
+    assert long.count("room\\_") == 3 * 41 and long.count("Sequence & full") == 6
+
+
+@pytest.mark.parametrize(("name", "is_latin"), [("fläche_ő", True), ("日本", False), ("u\u0308ber", False)])
+def test_latex_names_the_program_for_other_scripts(name: str, is_latin: bool) -> None:
+    text = format_latex(runs(name, "full", 0.1))
+    assert ("% XeLaTeX or LuaLaTeX" in text.splitlines()[1]) != is_latin
+
+
 def test_csv_has_unrounded_values() -> None:
     table = list(csv.DictReader(format_csv(OUTCOMES).splitlines()))
     ours = {(row["metric"], row["sequence"], row["method"]): row for row in table}
