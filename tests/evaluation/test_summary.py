@@ -194,6 +194,15 @@ def test_screen_table_fits_and_brackets_are_not_markup() -> None:
     assert "…" not in text and "DynaSLAM" not in text
 
 
+def test_long_names_on_the_screen_lack_their_middle() -> None:
+    console = Console(width=200, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    for table in make_screen_tables([*runs("x" * 99 + "y" * 101, "full", 0.1), *runs("s" * 40, "full", 0.1)])[:1]:
+        console.print(table)
+    text = console.export_text()
+    assert f" {'x' * 20}…{'y' * 20} " in text and f" {'s' * 40} " in text
+    assert max(map(len, text.splitlines())) < 60
+
+
 @pytest.mark.parametrize(("factor", "colour"), [(0.5, "32"), (2.0, "35")])  # green, magenta
 def test_screen_explains_brackets_and_colours_below_the_tables(factor: float, colour: str) -> None:
     outcomes = [*runs("demo", "full", 0.1, 0.2, 0.3), *runs("demo", "fast", *(factor * x for x in (0.1, 0.2, 0.3)))]

@@ -13,6 +13,13 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from v3d_torch.io.text import shorten
+
+_MAX_SCREEN_NAME = 40
+"""Maximum number of characters of a name on the screen, so that one long name does not widen all rows; the middle of a
+longer one is left out."""
+
+
 _MAX_ROWS_OF_A_PAGE = 40
 """Number of rows above which a LaTeX table breaks across pages."""
 
@@ -163,7 +170,8 @@ def make_screen_table(table: ErrorTable, first_heading: str = "sequence", note: 
         # Put the range below the median, and the number of failed runs below the range.
         texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
         marked = [f"[{cell.style}]{t}[/]" if cell.style else t for t, cell in zip(texts, cells, strict=True)]
-        shown.add_row(escape(name.replace(" (", "\n(")), *marked)
+        lines = [shorten(line, _MAX_SCREEN_NAME) for line in name.replace(" (", "\n(").split("\n")]
+        shown.add_row(escape("\n".join(lines)), *marked)
     return shown
 
 
