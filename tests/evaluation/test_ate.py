@@ -103,6 +103,18 @@ def test_convention_scale_error_starts_at_factor_of_one_and_a_half(size: float, 
     assert factor == (pytest.approx(size) if is_error else None)
 
 
+@pytest.mark.parametrize(("spread", "is_error"), [(0.051, True), (0.049, False)])
+def test_convention_scale_error_requires_path_of_five_centimetres(spread: float, is_error: bool) -> None:
+    """By the root mean square distance of the true positions from their mean."""
+    truth = random_walk(40, seed=20).T_wc
+    centred = truth[:, :3, 3] - truth[:, :3, 3].mean(dim=0)
+    truth[:, :3, 3] = centred * spread / centred.square().sum(dim=1).mean().sqrt()
+    estimate = truth.clone()
+    estimate[:, :3, 3] *= 2
+    factor = scale_error(truth, estimate, align(truth, estimate))
+    assert factor == (pytest.approx(0.5) if is_error else None)
+
+
 def test_scale_error_requires_three_quarters_of_variance_explained() -> None:
     """The estimate has noise, relative to the signal, across the direction of motion."""
     truth = torch.eye(4, dtype=torch.float64).repeat(4, 1, 1)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource
-from v3d_torch.evaluation.evaluation import absent_scores, format_coverage
+from v3d_torch.evaluation.evaluation import absent_scores, format_coverage, note_too_few_poses
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
 
@@ -62,6 +62,22 @@ def test_estimate_of_other_shape_has_no_depth_unit_note(seed: int) -> None:
     one, other = (se3_exp(torch.randn(60, 6, dtype=torch.float64, generator=generator)) for _ in range(2))
     other[:, :3, 3] *= 5
     assert "times as large" not in " ".join(evaluate(Trajectory(stamps, one), Trajectory(stamps, other)).notes)
+
+
+def test_lost_poses_do_not_indicate_depth_unit() -> None:
+    """The camera is lost in the second half of its path, where the estimate stays at the last known pose."""
+    groundtruth = random_walk(60, seed=18)
+    groundtruth.T_wc[:, :3, 3] = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
+    estimate = Trajectory(groundtruth.stamps, groundtruth.T_wc.clone())
+    estimate.T_wc[30:, :3, 3] = estimate.T_wc[29, :3, 3]
+    is_located = torch.arange(60) < 30
+    assert "times as large" in " ".join(evaluate(groundtruth, estimate).notes)
+    evaluation = evaluate(groundtruth, estimate, is_located=is_located)
+    assert "times as large" not in " ".join(evaluation.notes) and evaluation.ate.rmse > 0.1
+    estimate.T_wc[:, :3, 3] /= 5
+    assert "is 5 times as large" in " ".join(evaluate(groundtruth, estimate, is_located=is_located).notes)
+    two = torch.arange(60) < 2
+    assert "times as large" not in " ".join(evaluate(groundtruth, estimate, is_located=two).notes)
 
 
 def test_placeholder_orientations_give_no_rpe() -> None:
@@ -128,6 +144,14 @@ def test_coverage_and_json_values() -> None:
     assert values["rpe"]["rot"]["std"] == evaluation.rpe.rot.std
     assert absent_scores(45, 60).keys() == values.keys() and absent_scores(45, 60)["coverage"] == 0.75
     assert values["coverage"] == 0.75 and values["alignment"]["rotation_from"] == "positions"
+
+
+def test_too_few_poses_for_scores_are_noted() -> None:
+    groundtruth = random_walk(60, seed=19)
+    one, two = (note_too_few_poses(groundtruth, poses) for poses in (1, 2))
+    assert one == ("only 1 pose: at least 3 are needed for an ATE",) and two[0].startswith("only 2 poses: at")
+    assert note_too_few_poses(groundtruth, 3) == note_too_few_poses(None, 2) == ()
+    assert absent_scores(1, 1, one)["notes"] == list(one)
 
 
 def test_arguments_that_are_not_trajectories_are_rejected() -> None:

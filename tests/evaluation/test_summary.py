@@ -128,6 +128,8 @@ def test_line_of_a_run_without_scores_tells_why() -> None:
     assert str(Outcome("s", "full", 0, {"ate": None})) == "s, full, seed 0: no ground truth, not scored"
     lost = Outcome("s", "full", 0, {"ate": None, "diagnosis": "s: the camera was not found in any of the 9 frames"})
     assert str(lost) == "s, full, seed 0: s: the camera was not found in any of the 9 frames"
+    short = Outcome("s", "full", 0, {"ate": None, "notes": ["only 2 poses: at least 3 are needed for an ATE"]})
+    assert str(short) == "s, full, seed 0: only 2 poses: at least 3 are needed for an ATE"
 
 
 def test_latex_is_balanced_and_has_same_values() -> None:
@@ -148,6 +150,22 @@ def test_latex_is_balanced_and_has_same_values() -> None:
         depth += (character == "{") - (character == "}")
         assert depth >= 0
     assert depth == 0
+
+
+def test_long_latex_tables_break_across_pages() -> None:
+    outcomes = [run for i in range(41) for run in runs(f"room_{i}", "full", 0.1)]
+    short, long = format_latex(outcomes[:40]), format_latex(outcomes)
+    assert "table*" in short and "longtable" not in short
+    assert long.splitlines()[1].startswith("% \\usepackage{longtable}") and "table*" not in long
+    assert long.count("\\begin{longtable}{lr}") == long.count("\\end{longtable}") == 3
+    assert long.count("\\toprule") == long.count("\\midrule") == 6 and long.count("\\bottomrule") == 3
+    assert long.count("room\\_") == 3 * 41 and long.count("Sequence & full") == 6
+
+
+@pytest.mark.parametrize(("name", "is_latin"), [("fläche_ő", True), ("日本", False), ("u\u0308ber", False)])
+def test_latex_names_the_program_for_other_scripts(name: str, is_latin: bool) -> None:
+    text = format_latex(runs(name, "full", 0.1))
+    assert ("% XeLaTeX or LuaLaTeX" in text.splitlines()[1]) != is_latin
 
 
 def test_csv_has_unrounded_values() -> None:
@@ -174,6 +192,15 @@ def test_screen_table_fits_and_brackets_are_not_markup() -> None:
     for words in ("my & [own]", "[0.0100-0.0151]", "V3D-SLAM", "1 failed", "RPE, deg/s"):
         assert words in text
     assert "…" not in text and "DynaSLAM" not in text
+
+
+def test_long_names_on_the_screen_lack_their_middle() -> None:
+    console = Console(width=200, record=True, file=open(os.devnull, "w"))  # noqa: SIM115, PTH123
+    for table in make_screen_tables([*runs("x" * 99 + "y" * 101, "full", 0.1), *runs("s" * 40, "full", 0.1)])[:1]:
+        console.print(table)
+    text = console.export_text()
+    assert f" {'x' * 20}…{'y' * 20} " in text and f" {'s' * 40} " in text
+    assert max(map(len, text.splitlines())) < 60
 
 
 @pytest.mark.parametrize(("factor", "colour"), [(0.5, "32"), (2.0, "35")])  # green, magenta

@@ -110,6 +110,15 @@ def test_invalid_output_of_the_segmenter_is_rejected(returned: Any, message: str
         make_slam(lambda _: returned)(FRAME)
 
 
+def test_instances_without_pixels_are_left_out() -> None:
+    none = replace(INSTANCES, masks=torch.zeros_like(INSTANCES.masks))
+    some = replace(INSTANCES, masks=torch.stack([none.masks[0], INSTANCES.masks[1]]))
+    segmentation = make_slam(lambda _: some).segment_instances(FRAME, None)
+    assert segmentation.instances is not None and segmentation.instances.labels.tolist() == [56]
+    assert make_slam(lambda _: none)(FRAME).objects == []
+    assert make_slam(lambda _: INSTANCES).segment_instances(FRAME, None).instances is INSTANCES
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

@@ -143,3 +143,20 @@ def test_label_without_a_place_is_hidden() -> None:
     separate_labels(figure)
     shown = [text for text in axes.texts if text.get_visible()]
     assert 1 <= len(shown) < 10
+
+
+def test_labels_stay_inside_the_image_and_those_left_out_are_counted(tmp_path: Path) -> None:
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[44:, 20:40] = True
+    figure = Figure(figsize=(4, 3))
+    axes = figure.add_subplot()
+    objects = [(mask, f"chair {number}", "static") for number in range(4)]
+    draw_objects(axes, torch.zeros(3, 48, 64, dtype=torch.uint8), objects)
+    hidden = separate_labels(figure)
+    figure.draw_without_rendering()
+    shown = [patch for text in axes.texts if text.get_visible() and (patch := text.get_bbox_patch()) is not None]
+    assert len(shown) == 4 - hidden and hidden > 0 and shown
+    assert all(patch.get_window_extent().y0 >= axes.bbox.y0 - 1 for patch in shown)
+    save_mask_figure([torch.zeros(3, 48, 64, dtype=torch.uint8)], [objects], tmp_path / "masks.svg")
+    drawing = (tmp_path / "masks.svg").read_text()
+    assert f"<!-- {4 - drawing.count('<!-- chair')} names left out -->" in drawing

@@ -73,6 +73,12 @@ def test_objects_of_few_frames_are_not_drawn() -> None:
     assert draw_axes(table).get_xlabel() == "x [m]\nnot drawn: 1 that were seen in fewer than 5 frames"
 
 
+def test_objects_without_a_name_are_counted() -> None:
+    axes = draw_axes(table_of(*((number, MotionState.STATIC) for number in range(1, 60))))
+    named = sum(text.get_visible() for text in axes.texts)
+    assert named <= 50 and axes.get_xlabel() == f"x [m]\nwithout a name: {59 - named}"
+
+
 def test_path_has_gap_where_the_object_was_not_seen() -> None:
     table, away = table_of((1, MotionState.DYNAMIC)), object_at(3.0, 1, 4.0, MotionState.DYNAMIC)
     for index in (30, 31):

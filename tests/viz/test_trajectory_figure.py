@@ -71,6 +71,14 @@ def test_few_poses_and_static_camera_are_drawn(tmp_path: Path, poses: int, groun
     assert (count_pixels(image, BLUE) > 300) == (poses > 2)
 
 
+@pytest.mark.parametrize("poses", [1, 2, 3])
+def test_error_of_fewer_than_three_poses_is_not_drawn(poses: int) -> None:
+    estimate = shaken(arc(), 1e-3)
+    figure = draw_trajectory(arc(), Trajectory(estimate.stamps[:poses], estimate.T_wc[:poses]))
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert any("ATE RMSE" in label for label in labels) == (poses == 3)
+
+
 def test_curve_has_gap_where_poses_are_missing(tmp_path: Path) -> None:
     present = torch.cat([torch.arange(0, 20), torch.arange(40, 60)])
     estimate = Trajectory(arc().stamps[present], arc().T_wc[present])

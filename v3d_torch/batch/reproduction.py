@@ -21,14 +21,18 @@ from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.evaluation import ablation
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.evaluation.summary import (
-    LATEX_PACKAGES,
     LEGEND,
     format_csv,
     format_latex,
     format_markdown,
     make_screen_tables,
 )
-from v3d_torch.evaluation.tables import format_latex_table, format_markdown_table, make_screen_legend, make_screen_table
+from v3d_torch.evaluation.tables import (
+    format_latex_document,
+    format_markdown_table,
+    make_screen_legend,
+    make_screen_table,
+)
 from v3d_torch.io.files import write_text
 from v3d_torch.runs.open_sequences import open_sequence
 from v3d_torch.runs.print_line import print_line
@@ -127,9 +131,7 @@ class ReproductionRecord(BatchRecord):
             ]
             legend = f"{LEGEND} {ablation.RATIO_LEGEND}"
             write_text(self.folder / "ablation.md", "\n".join(document) + "\n")
-            write_text(
-                self.folder / "ablation.tex", "\n".join([LATEX_PACKAGES, *format_latex_table(table, legend)]) + "\n"
-            )
+            write_text(self.folder / "ablation.tex", format_latex_document([table], legend))
             write_text(self.folder / "ablation.csv", ablation.format_csv(self._study_outcomes))
 
     def screen_tables(self) -> list[RenderableType]:

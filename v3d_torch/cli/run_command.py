@@ -18,7 +18,7 @@ from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.evaluation import Evaluation
-from v3d_torch.evaluation.evaluation import format_coverage
+from v3d_torch.evaluation.evaluation import format_coverage, note_too_few_poses
 from v3d_torch.evaluation.outcome import label_sequence
 from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
@@ -251,7 +251,8 @@ def _print_summary(
         console.print(paper)
     if display.profile and record.times:
         console.print(profile_table(record))
-    for note in evaluation.notes if evaluation is not None else ():
+    absent = note_too_few_poses(pipeline.sequence.groundtruth, len(pipeline.slam.poses))
+    for note in absent if evaluation is None else evaluation.notes:
         print_line(console, f"note: {note}")
     if record.save_error is not None:
         print_line(console, f"note: no checkpoint was saved, {record.save_error}")

@@ -23,6 +23,10 @@ _MIN_SCALE_FACTOR = 1.5
 """Minimum ratio between the sizes of two trajectories for a scale error: drift changes the size by less, a wrong unit
 of depth by more."""
 
+_MIN_PATH_SPREAD = 0.05
+"""Minimum root mean square distance of the true positions from their mean, for a scale error, metres. On shorter paths,
+tracking errors that depend on the motion of the camera can be as large as the path and have its shape."""
+
 _MAX_UNEXPLAINED_VARIANCE = 0.25
 """Maximum fraction of the ground truth's variance that a rescaled estimate does not explain, for a scale error. With a
 larger fraction, the estimate has another shape, and its size does not indicate the unit of depth."""
@@ -163,10 +167,13 @@ def scale_error(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> float | Non
 
     Returns:
         Size of the ground truth divided by the size of the estimate. None if both sizes agree within a factor of
-        `_MIN_SCALE_FACTOR`, or if the shapes differ (more than `_MAX_UNEXPLAINED_VARIANCE` after rescaling).
+        `_MIN_SCALE_FACTOR`, if the shapes differ (more than `_MAX_UNEXPLAINED_VARIANCE` after rescaling), or if the
+        true positions spread less than `_MIN_PATH_SPREAD`.
     """
     p_g, p_e = T_gc[:, :3, 3], (alignment.T_ge @ T_ec)[:, :3, 3]
     p_g, p_e = p_g - p_g.mean(dim=0), p_e - p_e.mean(dim=0)
+    if p_g.square().sum(dim=-1).mean().sqrt() < _MIN_PATH_SPREAD:
+        return None
     factor = float((p_g * p_e).sum() / p_e.square().sum())
     unexplained = (factor * p_e - p_g).square().sum() / p_g.square().sum()
     same_size = 1 / _MIN_SCALE_FACTOR < factor < _MIN_SCALE_FACTOR

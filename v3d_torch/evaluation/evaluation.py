@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
@@ -68,6 +70,7 @@ def evaluate(
     max_time_difference: float = MAX_TIME_DIFFERENCE,
     rpe_delta: float = 1.0,
     frames: int | None = None,
+    is_located: Tensor | None = None,
 ) -> Evaluation:
     """Evaluate a trajectory by the protocol of the TUM RGB-D benchmark, which the paper's tables follow.
 
@@ -81,6 +84,8 @@ def evaluate(
         max_time_difference: Maximum difference between the timestamps of a pair, seconds.
         rpe_delta: Time over which the RPE measures drift, seconds.
         frames: Number of colour-depth pairs of the sequence, for the coverage.
+        is_located: True for each pose of the estimate that was measured relative to the map, bool, shape :math:`(N,)`;
+            None if this is not known. The other poses count for the errors, but do not indicate the scale of depth.
 
     Raises:
         InputError: If fewer than three poses can be associated, or if an argument is not a trajectory.
@@ -104,7 +109,7 @@ def evaluate(
     notes = []
     if alignment.source is RotationSource.ORIENTATIONS:
         notes.append("the ground-truth positions do not span a plane: aligned by the mean of the orientations")
-    factor = scale_error(T_gc, T_ec, alignment)
+    factor = _located_scale_error(T_gc, T_ec, None if is_located is None else is_located[matches.estimate], oriented)
     if factor is not None:
         notes.append(f"the ground truth is {factor:.3g} times as large as the estimate: check depth_scale")
     rpe = relative_pose_error(groundtruth, estimate, matches, rpe_delta) if oriented else None
@@ -125,15 +130,28 @@ def evaluate(
     )
 
 
-def absent_scores(poses: int, frames: int | None) -> dict[str, Any]:
+def note_too_few_poses(groundtruth: Trajectory | None, poses: int) -> tuple[str, ...]:
+    """Return the notes of a trajectory without scores: that it has too few poses to compare with its ground truth.
+
+    Args:
+        groundtruth: Ground-truth poses; None if there are none, without a note.
+        poses: Number of estimated poses.
+    """
+    if groundtruth is None or poses >= MIN_PAIRS:
+        return ()
+    return (f"only {poses} {'pose' if poses == 1 else 'poses'}: at least {MIN_PAIRS} are needed for an ATE",)
+
+
+def absent_scores(poses: int, frames: int | None, notes: Sequence[str] = ()) -> dict[str, Any]:
     """Return the values of `Evaluation.to_dict` for a trajectory that cannot be compared with a ground truth.
 
     Args:
         poses: Number of estimated poses.
         frames: Number of frames of the sequence; None if it is not known.
+        notes: Reasons why there are no scores, one sentence each.
     """
     absent = dict.fromkeys(("ate", "rpe", "alignment"))
-    return {**absent, "pairs": 0, "poses": poses, "coverage": _coverage(poses, frames), "notes": []}
+    return {**absent, "pairs": 0, "poses": poses, "coverage": _coverage(poses, frames), "notes": list(notes)}
 
 
 def format_coverage(coverage: float) -> str:
@@ -160,6 +178,15 @@ def has_orientations(trajectory: Trajectory) -> bool:
 
 def _coverage(poses: int, frames: int | None) -> float | None:
     return min(poses / frames, 1.0) if frames else None
+
+
+def _located_scale_error(T_gc: Tensor, T_ec: Tensor, is_located: Tensor | None, oriented: bool) -> float | None:
+    """Compute the scale error of the poses that were measured relative to the map; None if there are too few."""
+    if is_located is not None:
+        T_gc, T_ec = T_gc[is_located], T_ec[is_located]
+    if len(T_gc) < MIN_PAIRS:
+        return None
+    return scale_error(T_gc, T_ec, align(T_gc, T_ec, oriented=oriented))
 
 
 def _suggest(true: float, estimated: float) -> str:

@@ -58,7 +58,8 @@ class Outcome:
 
     def __str__(self) -> str:
         ate = self.get_metric("ate.rmse")
-        score = f"ATE {ate:.4f} m" if ate is not None else self.diagnosis or "no ground truth, not scored"
+        cause = self.diagnosis or "; ".join(self.metrics.get("notes", ())) or "no ground truth, not scored"
+        score = f"ATE {ate:.4f} m" if ate is not None else cause
         if self.difference is not None:
             score += f" ({self.difference})"
         if skipped := self.get_metric("skipped"):

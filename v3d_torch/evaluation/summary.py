@@ -17,7 +17,7 @@ from v3d_torch.evaluation.paper_tables import HEADINGS, load_paper_scores
 from v3d_torch.evaluation.tables import (
     Cell,
     ErrorTable,
-    format_latex_table,
+    format_latex_document,
     format_lowest,
     format_markdown_table,
     format_median_and_range,
@@ -30,9 +30,6 @@ METRIC_KEYS: Mapping[str, str] = {"ate": "ate.rmse", "rpe_trans": "rpe.trans.rms
 
 LEGEND = "RMSE, median and [range] over the seeds; RPE over 1 s. The lowest value of a row is bold."
 """Explanation of the tables."""
-
-LATEX_PACKAGES = "% \\usepackage{booktabs}"
-"""First line of a LaTeX file of tables: the packages that it requires, as a comment."""
 
 _ERRORS = {"ate": "ATE", "rpe_trans": "RPE of the translation", "rpe_rot": "RPE of the rotation"}
 """Name of each metric in tables of ratios, which have no unit."""
@@ -97,10 +94,8 @@ def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> 
 
 
 def format_latex(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return all tables as LaTeX, which requires the package booktabs; see `make_error_tables`."""
-    tables = make_error_tables(outcomes, absent=absent)
-    lines = [LATEX_PACKAGES, *(line for table in tables for line in format_latex_table(table, LEGEND))]
-    return "\n".join(lines) + "\n"
+    """Return all tables as LaTeX, see `make_error_tables`."""
+    return format_latex_document(make_error_tables(outcomes, absent=absent), LEGEND)
 
 
 def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:

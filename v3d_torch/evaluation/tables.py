@@ -13,6 +13,19 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from v3d_torch.io.text import shorten
+
+_MAX_SCREEN_NAME = 40
+"""Maximum number of characters of a name on the screen, so that one long name does not widen all rows; the middle of a
+longer one is left out."""
+
+
+_MAX_ROWS_OF_A_PAGE = 40
+"""Number of rows above which a LaTeX table breaks across pages."""
+
+_LAST_PDFLATEX_LETTER = "\u017f"
+"""Last letter of Latin Extended-A: pdfLaTeX has no characters of other scripts."""
+
 
 class Cell(NamedTuple):
     """Cell of a table.
@@ -97,22 +110,48 @@ def format_markdown_table(table: ErrorTable, first_heading: str = "sequence", no
     return lines
 
 
-def format_latex_table(table: ErrorTable, legend: str) -> list[str]:
-    """Return the lines of a LaTeX table, marked values in bold. It requires the package booktabs."""
-    lines = [
-        "\\begin{table*}",
-        "  \\centering",
-        f"  \\caption{{{_escape_latex(table.heading)}. {_escape_latex(legend)}}}",
-        f"  \\begin{{tabular}}{{l{'r' * len(table.methods)}}}",
-        "    \\toprule",
-        f"    {_latex_row(['Sequence', *map(_escape_latex, table.methods)])}",
-        "    \\midrule",
-    ]
+def format_latex_document(tables: Sequence[ErrorTable], legend: str) -> str:
+    """Return tables as LaTeX, marked values in bold; the first lines are comments with the packages they require.
+
+    Args:
+        tables: Tables.
+        legend: Explanation in each caption.
+    """
+    lines = [line for table in tables for line in _latex_table(table, legend)]
+    head = ["% \\usepackage{booktabs}"]
+    if any(_is_long(table) for table in tables):
+        head.append("% \\usepackage{longtable}, whose tables break across pages, in documents with one column")
+    if any(character > _LAST_PDFLATEX_LETTER for line in lines for character in line):
+        head.append("% XeLaTeX or LuaLaTeX, and a font (\\setmainfont of fontspec) with all characters of the names")
+    return "\n".join([*head, *lines]) + "\n"
+
+
+def _latex_table(table: ErrorTable, legend: str) -> list[str]:
+    caption = f"\\caption{{{_escape_latex(table.heading)}. {_escape_latex(legend)}}}"
+    columns = "l" + "r" * len(table.methods)
+    head = ["\\toprule", _latex_row(["Sequence", *map(_escape_latex, table.methods)]), "\\midrule"]
+    rows = []
     for sequence, cells in table.rows.items():
         texts = [_escape_latex(cell.text).replace("-", "--") for cell in cells]
         bold = [f"\\textbf{{{t}}}" if cell.is_bold else t for t, cell in zip(texts, cells, strict=True)]
-        lines.append(f"    {_latex_row([_escape_latex(sequence), *bold])}")
-    return [*lines, "    \\bottomrule", "  \\end{tabular}", "\\end{table*}"]
+        rows.append(_latex_row([_escape_latex(sequence), *bold]))
+    if _is_long(table):
+        repeated = [*head, "\\endfirsthead", *head, "\\endhead", "\\bottomrule", "\\endfoot"]
+        content = [f"{caption} \\\\", *repeated, *rows]
+        return [f"\\begin{{longtable}}{{{columns}}}", *(f"  {line}" for line in content), "\\end{longtable}"]
+    return [
+        "\\begin{table*}",
+        "  \\centering",
+        f"  {caption}",
+        f"  \\begin{{tabular}}{{{columns}}}",
+        *(f"    {line}" for line in [*head, *rows, "\\bottomrule"]),
+        "  \\end{tabular}",
+        "\\end{table*}",
+    ]
+
+
+def _is_long(table: ErrorTable) -> bool:
+    return len(table.rows) > _MAX_ROWS_OF_A_PAGE
 
 
 def make_screen_table(table: ErrorTable, first_heading: str = "sequence", note: str = "") -> Table:
@@ -131,7 +170,8 @@ def make_screen_table(table: ErrorTable, first_heading: str = "sequence", note: 
         # Put the range below the median, and the number of failed runs below the range.
         texts = [escape(cell.text.replace(" [", "\n[").replace(", ", ",\n")) for cell in cells]
         marked = [f"[{cell.style}]{t}[/]" if cell.style else t for t, cell in zip(texts, cells, strict=True)]
-        shown.add_row(escape(name.replace(" (", "\n(")), *marked)
+        lines = [shorten(line, _MAX_SCREEN_NAME) for line in name.replace(" (", "\n(").split("\n")]
+        shown.add_row(escape("\n".join(lines)), *marked)
     return shown
 
 

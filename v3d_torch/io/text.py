@@ -38,6 +38,11 @@ def printable(value: object) -> str:
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in str(value))
 
 
+def shorten(text: str, length: int) -> str:
+    """Leave out the middle of a text that is longer than a number of characters; names often differ at their ends."""
+    return text if len(text) <= length else f"{text[: length // 2]}…{text[-(length // 2) :]}"
+
+
 def read_text(path: Path, expected: str) -> str:
     r"""Read a UTF-8 text file.
 

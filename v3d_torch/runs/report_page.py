@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
+from v3d_torch.evaluation.evaluation import note_too_few_poses
 from v3d_torch.io.image_file import read_image
 from v3d_torch.runs.file_names import FIGURES, MASKS
 from v3d_torch.runs.stored_run import StoredRun
@@ -72,6 +73,7 @@ def render_page(run: StoredRun) -> str:
         metrics=run.metrics,
         folder=run.folder.resolve().name,  # resolved, because "latest" changes and "." is not a name
         evaluation=run.evaluation,
+        absent_notes=note_too_few_poses(run.groundtruth, len(run.metrics.status)),
         pose_plots=_pose_plots(run),
         tracking_plots=_tracking_plots(run),
         objects=_object_plot(run),

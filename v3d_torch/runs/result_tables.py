@@ -98,7 +98,8 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
     evaluation = None
     if groundtruth is not None and slam.poses.is_localised:
         with suppress(InputError):  # too few poses for scores
-            evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count)
+            is_located = torch.tensor([status.is_located for status in slam.poses.statuses])
+            evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count, is_located=is_located)
     return ResultTables(
         trajectory=trajectory,
         keyframes=Trajectory(stamps, invert(stack_poses(keyframes))),

@@ -18,7 +18,7 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.evaluation import Evaluation
-from v3d_torch.evaluation.evaluation import absent_scores
+from v3d_torch.evaluation.evaluation import absent_scores, note_too_few_poses
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.io.files import write_text
 from v3d_torch.io.ply import write_ply
@@ -112,9 +112,10 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
     frames = len(statuses)
     counts = {status.value: statuses.count(status) for status in TrackingStatus}
     masks = run.mask_evaluation.compute_scores()
+    notes = note_too_few_poses(pipeline.sequence.groundtruth, frames)
     total = f" of {len(pipeline.sequence)}" if isinstance(pipeline.sequence, Sized) else ""
     return {
-        **(absent_scores(frames, pipeline.frame_count) if evaluation is None else evaluation.to_dict()),
+        **(absent_scores(frames, pipeline.frame_count, notes) if evaluation is None else evaluation.to_dict()),
         "masks": masks.to_dict() if masks is not None else None,
         "sequence": pipeline.sequence.name,
         "difference": describe_difference(pipeline.sequence),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+import torch
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
@@ -82,7 +83,8 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     evaluation = None
     if truth is not None and trajectory is not None and metrics.is_localised:
         try:
-            evaluation = evaluate(truth, trajectory, frames=metrics.frames)
+            is_located = torch.tensor([status.is_located for status in metrics.status])
+            evaluation = evaluate(truth, trajectory, frames=metrics.frames, is_located=is_located)
         except InputError as error:
             if groundtruth is not None:
                 raise InputError(f"{groundtruth}: {error}") from error

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol, cast, runtime_checkable
 
+import torch
 from torch import Tensor, nn
 
 from v3d_torch.runtime.stateful import Stateful, has_methods, is_stateful
@@ -35,6 +36,19 @@ def segment_frame(segmenter: Segmenter, frame: RGBDFrame, T_cw: Tensor | None) -
     if has_methods(segmenter, "segment_with_pose"):
         return cast("PoseAwareSegmenter", segmenter).segment_with_pose(frame, T_cw)
     return segmenter(frame)
+
+
+def without_empty_masks(instances: Instances) -> Instances:
+    """Leave out instances without pixels: they have no position, so that each would become an object of one frame.
+
+    Args:
+        instances: Instances of a frame.
+
+    Returns:
+        The other instances; ``instances`` itself if every mask has pixels.
+    """
+    has_pixels = instances.masks.numpy().any(axis=(1, 2))  # NumPy is several times as fast here as torch
+    return instances[torch.from_numpy(has_pixels)]
 
 
 def innermost_segmenter(segmenter: Segmenter) -> Segmenter:

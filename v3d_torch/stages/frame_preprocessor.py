@@ -11,7 +11,7 @@ from v3d_torch.runtime.input_checks import check_frame, check_instances, check_p
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.segmentation.coco import LABELS
-from v3d_torch.segmentation.segmenter import segment_frame, segmenter_state_of
+from v3d_torch.segmentation.segmenter import segment_frame, segmenter_state_of, without_empty_masks
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.stages.protocols import DepthStage, FeatureStage
 from v3d_torch.stages.stage_checks import ReplaceableStages
@@ -83,7 +83,7 @@ class FramePreprocessor(ReplaceableStages):
     def segment_instances(
         self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
     ) -> Segmentation:
-        """Find the instances of a frame (III-A).
+        """Find the instances of a frame (III-A); those without pixels are left out.
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
@@ -103,6 +103,7 @@ class FramePreprocessor(ReplaceableStages):
                 T_cw = None if prediction is None else prediction.pose_at(frame.stamp)
                 instances = segment_frame(self.segment, frame, T_cw)
                 check_instances(instances, frame, LABELS)
+                instances = without_empty_masks(instances)
         return Segmentation(instances, segmenter_state_of(self.segment), timer.times)
 
     def extract_features(self, frame: RGBDFrame) -> Extraction:

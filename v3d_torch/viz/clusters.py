@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 BLACK = (0.0, 0.0, 0.0, 1.0)
 """Colour of the rejected points, RGBA."""
 
+_OTHERS = (0.88, 0.88, 0.88, 1.0)  # colour of the objects without a colour of their own, RGBA
+_MAX_COLOURS = 20  # of the palette: more objects cannot be told apart
 _MAX_POINTS = 3000  # drawn per cloud, evenly sampled; more points only hide the clouds behind
 _BORDER = 0.05  # metres around the points
 
@@ -61,6 +63,8 @@ def save_clusters_figure(clusters: Sequence[Cluster], path: Path, title: str = "
 def draw_clusters(clusters: Sequence[Cluster], title: str = "") -> Figure:
     """Draw clouds before outlier rejection, with the rejected points in black, and after it, from above the camera.
 
+    Of more than 20 objects, the 20 with the most points have a colour and a name; the others are light grey.
+
     Args:
         clusters: Clouds of the objects, at least one.
         title: Title of the figure.
@@ -70,12 +74,17 @@ def draw_clusters(clusters: Sequence[Cluster], title: str = "") -> Figure:
     """
     if not clusters:
         raise ValueError("a figure of clusters needs at least one cluster")
-    colours = [colormaps["tab20"](2 * i % 20 + i // 10 % 2) for i in range(len(clusters))]  # saturated colours first
+    largest = sorted(range(len(clusters)), key=lambda i: -len(clusters[i].before))[:_MAX_COLOURS]
+    named = {
+        i: colormaps["tab20"](2 * rank % 20 + rank // 10)  # saturated colours first
+        for rank, i in enumerate(sorted(largest))
+    }
     figure = Figure(figsize=(11.0, 5.8), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)
     before = cast("Axes3D", figure.add_subplot(1, 2, 1, projection="3d"))
     after = cast("Axes3D", figure.add_subplot(1, 2, 2, projection="3d"))
-    for cluster, colour in zip(clusters, colours, strict=True):
+    for i, cluster in enumerate(clusters):
+        colour = named.get(i, _OTHERS)
         _draw_points(before, cluster.before[cluster.inliers], colour, 1.0)
         _draw_points(before, cluster.before[~cluster.inliers], BLACK, 2.0)
         _draw_points(after, cluster.after, colour, 2.0)
@@ -85,7 +94,9 @@ def draw_clusters(clusters: Sequence[Cluster], title: str = "") -> Figure:
     after.set_title(f"after outlier rejection: {sum(len(cluster.after) for cluster in clusters)} voxels")
     _set_views([before, after], torch.cat([cluster.before for cluster in clusters]))
     figure.suptitle(title)
-    entries = zip([*(cluster.label for cluster in clusters), "rejected"], [*colours, BLACK], strict=True)
+    entries = [*((clusters[i].label, colour) for i, colour in named.items()), ("rejected", BLACK)]
+    if others := len(clusters) - len(named):
+        entries.append((f"and {others} more", _OTHERS))
     handles = [
         Line2D([], [], color=colour, label=label, marker="o", linestyle="none", markersize=5)
         for label, colour in entries

@@ -8,6 +8,8 @@ from functools import cache
 from matplotlib import font_manager
 from matplotlib.text import Text
 
+from v3d_torch.io.text import shorten
+
 _REPLACEMENT = "?"
 """Replacement for characters that no installed font has, instead of an empty box."""
 
@@ -25,9 +27,7 @@ def draw_title(set_title: Callable[..., Text], title: str) -> None:
         set_title: `Axes.set_title` or `Figure.suptitle`.
         title: Title.
     """
-    if len(title) > _MAX_TITLE:
-        title = f"{title[: _MAX_TITLE // 2]}…{title[-_MAX_TITLE // 2 :]}"
-    text, fonts = drawable_text(title)
+    text, fonts = drawable_text(shorten(title, _MAX_TITLE))
     set_title(text, parse_math=False, fontfamily=fonts)
 
 

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 from torch import Tensor
 
 from v3d_torch.viz.figure_output import save_figure
-from v3d_torch.viz.label_placement import separate_labels
+from v3d_torch.viz.label_placement import draw_legend_and_separate_labels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,8 +72,7 @@ def save_mask_figure(images: Sequence[Tensor], overlays: Sequence[Sequence[Overl
     present = {parse_motion_state(motion_state) for _, objects in frames for _, _, motion_state in objects}
     handles = [Patch(color=colour, label=name) for name, colour in MOTION_STATE_COLOURS.items() if name in present]
     if handles:
-        figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
-    separate_labels(figure)
+        draw_legend_and_separate_labels(figure, handles, len(MOTION_STATE_COLOURS) + 1)
     save_figure(figure, path)
 
 

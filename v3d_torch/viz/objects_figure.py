@@ -9,6 +9,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -72,13 +73,24 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     for state, colour in MOTION_STATE_COLOURS.items():
         if state in drawn:
             axes.plot([], [], color=colour, label=state)
-    note = f"\nnot drawn: {omitted} that were seen in fewer than {_MIN_FRAMES} frames" if omitted else ""
-    axes.set(xlabel=f"x [m]{note}", ylabel="y [m]", aspect="equal")
+    unnamed = len(rows) - len(named)
+    axes.set(xlabel=_axis_label(omitted, unnamed), ylabel="y [m]", aspect="equal")
     axes.grid(True, linewidth=0.4, alpha=0.5)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     draw_title(axes.set_title, title)
-    separate_labels(figure)
+    if hidden := separate_labels(figure):
+        axes.set_xlabel(_axis_label(omitted, unnamed + hidden))
     return figure
+
+
+def _axis_label(omitted: int, unnamed: int) -> str:
+    """Return the label of the x axis, and below it the numbers of objects that are not drawn or have no name."""
+    notes = []
+    if omitted:
+        notes.append(f"not drawn: {omitted} that were seen in fewer than {_MIN_FRAMES} frames")
+    if unnamed:
+        notes.append(f"without a name: {unnamed}")
+    return f"x [m]\n{'; '.join(notes)}" if notes else "x [m]"
 
 
 def _rows_of_objects(objects: ObjectTable) -> tuple[dict[int, Tensor], int]:
@@ -113,7 +125,8 @@ def _draw_object(axes: Axes, objects: ObjectTable, rows: Tensor, R_lw: Tensor, *
     axes.plot(*outline.T, color=colours[last], linewidth=1.0)
     if with_name:
         name = f"{class_name(int(objects['label'][rows][last]))} {int(objects['id'][rows][last])}"
-        axes.annotate(name, outline.max(axis=0), fontsize=6, color=colours[last])
+        rim = [Stroke(linewidth=1.5, foreground="white"), Normal()]  # lines of the same colour would hide the name
+        axes.annotate(name, outline.max(axis=0), fontsize=6, color=colours[last], path_effects=rim)
     if colours[last] == MOTION_STATE_COLOURS["dynamic"]:
         x, y = (R_lw @ objects["velocity"][rows][last])[:2].tolist()
         arrow = {"arrowstyle": "->", "color": colours[last]}

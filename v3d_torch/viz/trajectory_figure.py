@@ -14,7 +14,7 @@ from torch import Tensor
 
 from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
-from v3d_torch.evaluation.evaluation import has_orientations
+from v3d_torch.evaluation.evaluation import MIN_PAIRS, has_orientations
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import save_figure
@@ -58,8 +58,9 @@ def draw_trajectory(
     """Draw a trajectory as in the paper's figures: ground truth black, estimate blue, their difference red.
 
     The trajectory is projected onto the two axes with the largest extent. The estimate is aligned to the ground truth.
-    Without ground truth at the timestamps of the estimate, the estimate is drawn alone, in its own world frame. Poses
-    that were only guessed, of lost and of disconnected frames, are dotted.
+    With ground truth at the timestamps of fewer than three poses, which do not determine the alignment, the estimate
+    is drawn alone, in its own world frame. Poses that were only guessed, of lost and of disconnected frames, are
+    dotted.
 
     Args:
         groundtruth: Ground-truth poses, or None.
@@ -71,7 +72,7 @@ def draw_trajectory(
     curves: list[tuple[Tensor, Tensor, str, str]] = [(estimate.stamps, p_e, "tab:blue", "estimate")]
     segments, error = torch.zeros(0, 2, 3), 0.0
     matches = associate_trajectories(groundtruth, estimate) if groundtruth is not None else None
-    if groundtruth is not None and matches:
+    if groundtruth is not None and matches is not None and len(matches) >= MIN_PAIRS:
         T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
         alignment = align(T_gc, T_ec, oriented=has_orientations(groundtruth))
         truth = within(groundtruth, estimate)

@@ -13,7 +13,7 @@ from matplotlib.patheffects import Normal, Stroke
 from torch import Tensor
 
 from v3d_torch.viz.figure_output import save_figure
-from v3d_torch.viz.label_placement import separate_labels
+from v3d_torch.viz.label_placement import draw_legend_and_separate_labels
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS, Overlay, draw_objects, parse_motion_state
 
 VOTE_COLOUR = "#ff1f1f"
@@ -85,8 +85,7 @@ def draw_voting(
         axes.plot(*centre.tolist(), "o", color=colour, markeredgecolor="white", markersize=8, zorder=2.7)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), title=title)
     handles = _legend_handles(objects, ineffective=bool(ineffective))
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
-    separate_labels(figure)
+    draw_legend_and_separate_labels(figure, handles, 6)
     return figure
 
 
