@@ -9,6 +9,9 @@ import pyarrow.parquet as pq
 
 import v3d_torch
 from v3d_torch.batch.batch_record import write_runs
+from v3d_torch.batch.job import Job
+from v3d_torch.config import Config
+from v3d_torch.evaluation.outcome import Outcome
 
 RESULTS_PAGE = Path(v3d_torch.__file__).parents[1] / "docs" / "results.md"
 
@@ -19,3 +22,11 @@ def test_documentation_lists_every_column_of_the_table_of_runs(tmp_path: Path) -
     table = RESULTS_PAGE.read_text(encoding="utf-8").partition("| column of `runs.parquet` |")[2].partition("\n\n")[0]
     listed = [name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])]
     assert sorted(listed) == sorted(columns)
+
+
+def test_table_of_runs_has_each_warning_in_its_own_line(tmp_path: Path) -> None:
+    job = Job("room", "room", 1, "", None, "full", Config(), tmp_path / "room" / "full" / "seed0")
+    metrics = {"warnings": ["the depth seems to be late", "red and blue seem to be swapped"]}
+    write_runs(tmp_path / "runs.parquet", [(job, Outcome("room", "full", 0, metrics)), (job, job.make_outcome("lost"))])
+    written = pq.read_table(tmp_path / "runs.parquet")["warnings"].to_pylist()
+    assert written == ["the depth seems to be late\nred and blue seem to be swapped", ""]

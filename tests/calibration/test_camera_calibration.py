@@ -28,15 +28,18 @@ def no_intrinsics(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(camera_calibration, "better_focal_lengths", lambda _, camera, __: (camera.fx, camera.fy))
 
 
-def calibrate(scale: float | None = None, delay: float = 0.0, given: PinholeCamera = CAMERA) -> Calibration:
+def calibrate(
+    scale: float | None = None, delay: float = 0.0, given: PinholeCamera = CAMERA, shift: int = 0
+) -> Calibration:
     """Calibrate from views with a delay of depth.
 
     Args:
         scale: Size of the measured trajectory relative to the estimated one; None without measured poses.
         delay: Time of the depth image minus time of the colour image, seconds.
         given: Given camera.
+        shift: Shift of the depth images to the right, pixels.
     """
-    views, _ = make_views(COUNT, delay=delay)
+    views, _ = make_views(COUNT, delay=delay, shift=(shift, 0))
     _, trajectory = make_views(COUNT)
     groundtruth = None
     if scale is not None:
@@ -57,6 +60,21 @@ def test_delay_of_depth_is_accepted() -> None:
     estimate = estimate_of(calibration, "depth_delay")
     assert estimate.accepted and estimate.value == pytest.approx(0.04, abs=4 * estimate.sigma)
     assert calibration.camera.depth_delay == estimate.value
+
+
+@pytest.mark.parametrize(("delay", "accepted"), [(0.05, True), (0.02, False)])
+def test_delay_of_depth_includes_that_of_the_given_camera(delay: float, accepted: bool) -> None:
+    calibration = calibrate(delay=delay, given=replace(CAMERA, depth_delay=0.02))
+    estimate = estimate_of(calibration, "depth_delay")
+    assert estimate.value == pytest.approx(delay, abs=3e-3) and estimate.accepted is accepted
+    assert calibration.camera.depth_delay == (estimate.value if accepted else 0.02)
+
+
+@pytest.mark.parametrize("shift", [3, 6])
+def test_delay_is_estimated_only_if_the_depth_is_registered(shift: int) -> None:
+    """Registered means a shift below a hundredth of the width, 3.2 pixels."""
+    estimate = estimate_of(calibrate(delay=0.04, shift=shift), "depth_delay")
+    assert (estimate.accepted, estimate.reason) == ((True, "") if shift == 3 else (False, NOT_DETERMINED))
 
 
 def test_depth_scale_is_told_by_measured_poses_only() -> None:

@@ -35,6 +35,13 @@ def test_noise_of_other_pixels_does_not_hide_the_step() -> None:
     assert disparity_step(depth) == pytest.approx(0.0029, rel=0.03)
 
 
+def test_step_is_the_largest_if_fractions_of_it_fit_better() -> None:
+    """A fifth of the measurements lies between two steps, so that all are multiples of half a step."""
+    step, random = 0.0029, torch.rand(40_000, generator=torch.Generator().manual_seed(3))
+    steps = (1 / (room_depth() * step)).round() + 0.5 * (random < 0.2)
+    assert disparity_step(1 / (step * steps)) == pytest.approx(step, rel=0.03)
+
+
 def test_few_parallel_walls_have_no_step() -> None:
     for walls in (1, 2, 5, 12):
         depth = 1 + 3 * torch.rand(walls, generator=torch.Generator().manual_seed(walls))

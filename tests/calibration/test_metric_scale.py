@@ -29,12 +29,13 @@ def test_scale_is_found() -> None:
     assert scale == pytest.approx(1.25, rel=1e-6) and sigma < 1e-6
 
 
-def test_errors_agree_with_the_uncertainty() -> None:
+@pytest.mark.parametrize("scale", [0.2, 1.0, 5.0])
+def test_errors_agree_with_the_uncertainty(scale: float) -> None:
     squared = []
     for seed in range(20):
-        found = metric_scale(make_trajectory(), make_trajectory(noise=0.005, seed=seed))
+        found = metric_scale(make_trajectory(scale=scale), make_trajectory(noise=0.005, seed=seed))
         assert found is not None
-        squared.append(((found[0] - 1) / found[1]) ** 2)
+        squared.append(((found[0] - scale) / found[1]) ** 2)
     assert 0.3 < sum(squared) / len(squared) < 2.0
 
 
@@ -49,3 +50,11 @@ def test_few_poses_and_a_camera_that_only_turns_tell_no_scale() -> None:
     assert metric_scale(make_trajectory(5), make_trajectory(5)) is None
     assert metric_scale(make_trajectory(size=0.0), make_trajectory(size=0.0)) is None
     assert metric_scale(make_trajectory(), make_trajectory(scale=0.0)) is None
+
+
+def test_positions_that_are_not_correlated_tell_no_scale() -> None:
+    """All combinations of four signs: two are the measured position, the others the estimated one."""
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 4)
+    stamps, T_wc = torch.arange(16, dtype=torch.float64), torch.eye(4, dtype=torch.float64).repeat(2, 16, 1, 1)
+    T_wc[0, :, :2, 3], T_wc[1, :, :2, 3] = signs[:, :2], signs[:, 2:]
+    assert metric_scale(Trajectory(stamps, T_wc[0]), Trajectory(stamps, T_wc[1])) is None

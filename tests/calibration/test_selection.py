@@ -66,6 +66,22 @@ def test_only_the_group_that_is_wrong_is_accepted() -> None:
     assert all(reason in {AGREES, NOT_DETERMINED} or reason.startswith("cannot be told apart") for reason in reasons)
 
 
+@pytest.mark.parametrize(
+    ("name", "difference", "accepted"), [("fx", 2.6, False), ("fx", 52.0, True), ("cx", 1.0, False), ("cx", 20.0, True)]
+)
+def test_difference_that_errors_of_the_camera_model_explain_is_not_accepted(
+    name: str, difference: float, accepted: bool
+) -> None:
+    """With little noise. Focal lengths are accurate to 1.5 %, the centre to 0.5 % of the width."""
+    other = name.replace("x", "y")
+    given = replace(KNOWN, **{each: getattr(KNOWN, each) + difference for each in (name, other)})
+    estimates = select(given, noise=0.02)
+    for each in (estimates[name], estimates[other]):
+        assert (each.accepted, each.reason) == ((True, "") if accepted else (False, AGREES))
+        assert each.sigma >= (0.015 * each.value if name == "fx" else 0.005 * KNOWN.width)
+        assert each.value == pytest.approx(getattr(TRUE, each.name), abs=0.5)
+
+
 def test_camera_at_rest_tells_nothing() -> None:
     estimates = select(replace(KNOWN, fx=1.08 * TRUE.fx, fy=1.08 * TRUE.fy), swing=torch.zeros(6).double())
     assert not any(each.accepted for each in estimates.values() if each.name in ("fx", "fy", "cx", "cy"))
@@ -84,6 +100,15 @@ def test_errors_that_last_longer_than_a_block_make_the_variance_larger() -> None
     freedom = problem.residual_count / (problem.residual_count - problem.unknown_count)
     short = freedom * jackknife_covariance(drifting.gradient, drifting.hessian)
     assert float(covariance(problem, drifting)) > 1.2 * float(short)
+
+
+def test_variance_is_at_least_that_of_independent_errors() -> None:
+    """Nearly without gradients, all blocks agree, so that the variance of the jackknife is far too small."""
+    problem = SelfCalibration(make_map(KNOWN, KNOWN, points=60), KNOWN, Config())
+    _, at = problem.minimise(("fx", "cx"))
+    agreeing = at._replace(gradient=torch.full_like(at.gradient, 1e-9))
+    independent = torch.linalg.inv(at.hessian.sum(dim=0) / 2).diagonal()
+    torch.testing.assert_close(covariance(problem, agreeing).diagonal(), independent)
 
 
 def test_effect_of_a_shift_of_the_centre_is_the_shift() -> None:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from v3d_torch.datasets.lists import pair_lists, read_associations, read_image_list
+from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations, read_image_list
 from v3d_torch.errors import InputError
 
 STAMPS = st.floats(min_value=-1e10, max_value=1e10, allow_nan=False)
@@ -91,3 +91,15 @@ def test_any_bytes_are_a_valid_list_or_raise_input_error(tmp_path: Path, content
             assert read(tmp_path / "rgb.txt")
         except InputError as error:
             assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(("gap", "is_plausible"), [(9.0, True), (11.0, False), (0.0011, True), (0.0009, False)])
+def test_median_time_between_images_is_a_millisecond_to_ten_seconds(
+    tmp_path: Path, gap: float, is_plausible: bool
+) -> None:
+    pairs = [ImagePair(stamp, "rgb.png", "depth.png") for stamp in (0.0, gap, 2 * gap, 2 * gap + 100)]
+    if is_plausible:
+        check_stamp_unit(pairs, tmp_path)
+    else:
+        with pytest.raises(InputError, match=f"the images are {gap:g} s apart according to their timestamps"):
+            check_stamp_unit(pairs, tmp_path)

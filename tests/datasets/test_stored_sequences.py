@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tarfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -130,9 +131,19 @@ def test_ground_truth_file_is_read(folder: Path) -> None:
     assert groundtruth.T_wc[:, :3, 3].tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_index_out_of_range_raises_index_error(folder: Path) -> None:
-    with pytest.raises(IndexError, match="has 3 frames"):
-        load_sequence(str(folder))[3]
+def test_offset_of_inverse_depth_corrects_the_depth_of_every_frame(folder: Path) -> None:
+    measured = load_sequence(str(folder))
+    corrected = load_sequence(str(folder), camera=replace(measured.camera, inverse_depth_offset=0.01))
+    for before, after in zip(measured, corrected, strict=True):
+        known = before.depth > 0
+        torch.testing.assert_close(1 / after.depth[known], 1 / before.depth[known] + 0.01)
+        assert not known.all() and (after.depth[~known] == 0).all()
+
+
+@pytest.mark.parametrize("index", [3, -1])
+def test_index_out_of_range_raises_index_error(folder: Path, index: int) -> None:
+    with pytest.raises(IndexError, match=f"has 3 frames, index {index} is out of range"):
+        load_sequence(str(folder))[index]
 
 
 def test_frame_index_must_be_an_integer(folder: Path) -> None:

@@ -102,6 +102,15 @@ def test_undecodable_video_is_an_input_error(folder: Path, name: str) -> None:
         load_sequence(str(folder))
 
 
+def test_equal_timestamps_are_an_input_error(folder: Path) -> None:
+    """Matroska stores milliseconds, so that every second frame at 2000 Hz has the time of the one before."""
+    (folder / "rgb.avi").unlink()
+    write_colour(folder / "rgb.mkv", 2000, 6)
+    with pytest.raises(InputError, match=r"rgb\.mkv: its timestamps do not increase; pass the frame rate with --fps"):
+        load_sequence(str(folder))
+    assert len(load_sequence(str(folder), options=SourceOptions(fps=30))) == 3
+
+
 def test_missing_depth_video_is_an_input_error(folder: Path) -> None:
     (folder / "depth.mkv").unlink()
     with pytest.raises(InputError, match=r"rgb\.avi: expected one colour and one depth video, found rgb\.avi;"):

@@ -127,6 +127,24 @@ def test_scale_error_requires_three_quarters_of_variance_explained() -> None:
         assert (scale_error(truth, estimate, alignment) is not None) is is_error
 
 
+def test_motion_in_the_opposite_direction_is_no_scale_error() -> None:
+    """The orientations determine the rotation, so that the factor between the positions is negative."""
+    truth = torch.eye(4, dtype=torch.float64).repeat(20, 1, 1)
+    truth[:, 0, 3] = torch.arange(20)
+    estimate = truth.clone()
+    estimate[:, 0, 3] *= -1
+    assert scale_error(truth, estimate, align(truth, estimate)) is None
+
+
+@pytest.mark.parametrize("size", [0.0, 1.0], ids=["only turns", "moves"])
+def test_alignment_ignores_padding_of_any_value(size: float) -> None:
+    truth = random_walk(40, seed=13)
+    truth.T_wc[:, :3, 3] *= size
+    T_gc, T_ec = truth.T_wc, noisy(truth, seed=14).T_wc
+    padded = [torch.cat([T, random_walk(15, seed).T_wc]) for seed, T in ((15, T_gc), (16, T_ec))]
+    torch.testing.assert_close(align(*padded, torch.arange(55) < 40).T_ge, align(T_gc, T_ec).T_ge)
+
+
 def test_mean_orientation_equals_scipy() -> None:
     groundtruth = random_walk(40, seed=11)
     groundtruth.T_wc[:, :3, 3] = 0

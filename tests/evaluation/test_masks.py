@@ -188,6 +188,11 @@ def test_id_switches_equal_a_loop_over_frames(visits: list[tuple[float, int]]) -
     assert count_id_switches(*to_tensors(visits), max_absence=0.5) == switches
 
 
+@pytest.mark.parametrize(("absence", "switches"), [(0.5, 1), (0.5625, 0)])
+def test_id_that_changes_after_exactly_the_maximum_absence_is_a_switch(absence: float, switches: int) -> None:
+    assert count_id_switches(*to_tensors([(0.0, 1), (absence, 2)]), max_absence=0.5) == switches
+
+
 @given(VISITS)
 @settings(max_examples=50)
 def test_id_switches_are_invariant_to_renaming_and_grow_with_absence(visits: list[tuple[float, int]]) -> None:

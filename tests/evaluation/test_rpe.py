@@ -86,6 +86,16 @@ def test_rpe_skips_poses_without_ground_truth() -> None:
     torch.testing.assert_close(errors.trans, all_errors.trans[10:])
 
 
+def test_rpe_skips_pairs_of_which_one_pose_has_no_ground_truth() -> None:
+    """A perfect estimate of 60 poses at 10 Hz; a second of the ground truth is missing."""
+    truth = random_walk(60, seed=22, rate=10.0)
+    kept = (torch.arange(60) < 25) | (torch.arange(60) >= 35)
+    partial, estimate = Trajectory(truth.stamps[kept], truth.T_wc[kept]), noisy(truth, seed=23, sigma=0.0)
+    errors = motion_errors(partial, estimate, associate_trajectories(partial, estimate))
+    assert errors.first.tolist() == [*range(15), *range(35, 49)]
+    assert float(errors.trans.max()) < 1e-9
+
+
 def test_rpe_pairs_do_not_span_a_gap() -> None:
     """Without a pose one second later there is no pair, neither with itself nor with one three seconds later."""
     stamps = torch.cat([torch.arange(0, 1.05, 0.1), torch.arange(5, 8.05, 0.1)]).double()

@@ -105,6 +105,18 @@ def test_time_of_capture_is_that_of_a_live_stream_or_the_arrival() -> None:
     assert start <= times[0] <= times[1] <= times[2] <= MONOTONIC_CLOCK.now()
 
 
+def test_number_of_a_frame_counts_those_that_the_source_skipped() -> None:
+    class Bag:
+        skipped = 0
+
+        def __iter__(self) -> Iterator[RGBDFrame]:
+            for frame, skipped in zip(frames_at(range(3)), (0, 2, 5), strict=True):
+                self.skipped = skipped
+                yield frame
+
+    assert [item.number for item in capture(Bag())[1].items] == [1, 4, 8]
+
+
 def test_closing_stops_source_and_thread() -> None:
     stopped, taken = threading.Event(), threading.Event()
 

@@ -18,6 +18,9 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.live import LiveResult, LiveSLAM
+from v3d_torch.live.frame_capture import CapturedFrame
+from v3d_torch.live.latest_queue import LatestQueue
+from v3d_torch.live.live_preprocessor import LivePreprocessor
 from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
@@ -126,6 +129,23 @@ def test_tracking_does_not_wait_for_a_slow_network_on_every_frame() -> None:
     config = Config.model_validate({"segmentation": {"interval": 2}})
     LiveSLAM(source, V3DSLAM(CAMERA, segment, config))(send)
     assert segmented == list(range(0, FRAMES, 2))
+
+
+def test_at_most_every_second_tracked_frame_is_segmented_while_frames_are_dropped() -> None:
+    """Frames 2, 4 and 7 are dropped. A frame after a gap is not segmented if the tracked frame before it was."""
+    captured = LatestQueue[CapturedFrame]()
+    preprocessor = LivePreprocessor(captured, V3DSLAM(CAMERA, square))
+    preprocessor.start()
+    is_segmented = {}
+    for number in (1, 3, 5, 6, 8):
+        captured.put(CapturedFrame(Wall()[number], number, captured_at=0.0))
+        live = preprocessor.frames.take()
+        assert live is not None
+        preprocessor.begin_tracking(live)
+        is_segmented[live.captured.number] = live.is_segmented
+    captured.close()
+    preprocessor.close()
+    assert is_segmented == {1: True, 3: False, 5: True, 6: True, 8: False}
 
 
 def test_error_of_a_frame_ends_the_run_after_the_frames_before() -> None:

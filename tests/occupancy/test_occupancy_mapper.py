@@ -18,7 +18,8 @@ from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
-from v3d_torch.occupancy.up_direction import estimate_up
+from v3d_torch.occupancy.range_view import RangeView
+from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runs.state import STATE_CLASSES
 from v3d_torch.tracking.pose_history import PoseHistory
@@ -40,13 +41,19 @@ class Drive:
         self.keyframes = [keyframe(invert(POSES[0])), keyframe(invert(POSES[18]), frame=18)]
         self.poses = PoseHistory()
 
-    def add(self, first: int, last: int, status: TrackingStatus = TrackingStatus.TRACKED) -> None:
+    def add(
+        self,
+        first: int,
+        last: int,
+        status: TrackingStatus = TrackingStatus.TRACKED,
+        up: UpDirection | None = None,
+    ) -> None:
         """Add frames; what the camera sees does not depend on the corrections of the keyframes."""
         for index in range(first, last):
             own = self.keyframes[index // 18 % 2]
             T_cw = invert(POSES[index % 36]) @ POSES[18 * (index // 18 % 2)] @ own.T_cw
             self.poses.append(index / 30, FramePose(status, T_cw, torch.zeros(0).long()), MOTION, own, None)
-            self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses)
+            self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses, up)
 
     def correct(self, row: int = 0, shift: Tensor = SHIFT) -> None:
         """Move a keyframe, as bundle adjustment and loop closing do."""
@@ -116,6 +123,17 @@ def test_rebuild_is_spread_over_frames_and_ends_with_the_corrected_map() -> None
     assert same_map(drive.mapper.map, truth.mapper.map)
 
 
+def test_corrections_during_a_rebuild_do_not_delay_its_end() -> None:
+    """A rebuild of 70 views takes longer than the time between two corrections, ten views."""
+    drive = Drive(OccupancyMapper(CONFIG, CAMERA))
+    drive.add(0, 60)
+    uncorrected = drive.mapper.map.blocks
+    for first in (60, 70, 80):
+        drive.correct()
+        drive.add(first, first + 10)
+    assert drive.mapper.map.blocks is not uncorrected
+
+
 def test_correction_during_a_rebuild_is_applied_afterwards() -> None:
     drive, truth = Drive(OccupancyMapper(CONFIG, CAMERA)), Drive(OccupancyMapper(CONFIG, CAMERA))
     drive.add(0, 29)
@@ -130,14 +148,19 @@ def test_correction_during_a_rebuild_is_applied_afterwards() -> None:
     assert same_map(drive.mapper.map, truth.mapper.map)
 
 
-def follow(mapper: OccupancyMapper, T_wc: Tensor, depth: Callable[[Tensor], Tensor]) -> tuple[PoseHistory, Keyframe]:
+def follow(
+    mapper: OccupancyMapper, poses: PoseHistory, start: Keyframe, T_wc: Tensor, depth: Callable[[Tensor], Tensor]
+) -> None:
     """Add frames at poses, (N, 4, 4), which are relative to one keyframe; `depth` renders the image of a pose."""
-    start, poses = keyframe(HERE), PoseHistory()
-    for index, T in enumerate(T_wc):
-        pose = FramePose(TrackingStatus.TRACKED, invert(T), torch.zeros(1).long())
-        poses.append(index / 30, pose, MOTION, start, None)
+    for T in T_wc:
+        pose = FramePose(TrackingStatus.TRACKED, invert(T) @ start.T_cw, torch.zeros(1).long())
+        poses.append(len(poses) / 30, pose, MOTION, start, None)
         mapper(depth(T), ALL, poses)
-    return poses, start
+
+
+def wall(_: Tensor) -> Tensor:
+    """Depth image of a wall 2 m in front of the camera, metres, (1, H, W)."""
+    return torch.full((1, CAMERA.height, CAMERA.width), 2.0)
 
 
 def corridor(T_wc: Tensor) -> Tensor:
@@ -152,7 +175,8 @@ def test_places_of_removed_views_stay_in_the_map_after_a_correction() -> None:
     mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 20}), CAMERA)
     along_wall = HERE.repeat(40, 1, 1)
     along_wall[:, 0, 3] = 0.6 * torch.arange(40)
-    poses, start = follow(mapper, along_wall, lambda _: torch.full((1, CAMERA.height, CAMERA.width), 2.0))
+    poses, start = PoseHistory(), keyframe(HERE)
+    follow(mapper, poses, start, along_wall, wall)
     assert len(mapper._store) <= 20
     before = mapper.map.occupied_points[:, 0]
     start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.0, 0.04, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
@@ -163,13 +187,30 @@ def test_places_of_removed_views_stay_in_the_map_after_a_correction() -> None:
     assert len(after.div(0.4).floor().unique()) == len(before.div(0.4).floor().unique())  # without gaps
 
 
+def test_places_of_views_that_are_removed_during_a_rebuild_keep_its_correction() -> None:
+    """The rebuild begins with the 20th view; the 21st removes the first three, which it contains already."""
+    mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 20}), CAMERA)
+    along_wall = HERE.repeat(21, 1, 1)
+    along_wall[:, 0, 3] = 0.6 * torch.arange(21)
+    poses, start = PoseHistory(), keyframe(HERE)
+    follow(mapper, poses, start, along_wall[:19], wall)
+    start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.0, 0.0, -0.4, 0.0, 0.0, 0.0], dtype=torch.float64))
+    follow(mapper, poses, start, along_wall[19:], wall)
+    assert is_rebuilding(mapper) and mapper._store.frames[0] == 3
+    start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.0, 0.04, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    mapper.correct(poses)
+    x, _, z = mapper.map.occupied_points.T
+    torch.testing.assert_close(z[x < 0.4], torch.full_like(z[x < 0.4], 2.4), atol=0.1, rtol=0)
+
+
 def test_walls_that_the_remaining_views_hardly_see_stay_in_the_map_after_a_correction() -> None:
     mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 45, "stride": 12}), CAMERA)
     twists = torch.zeros(130, 6, dtype=torch.float64)
     twists[:, 4] = torch.arange(130) % 9 * (2 * torch.pi / 9)
     along_corridor = se3_exp(twists)
     along_corridor[:, 2, 3] = 0.15 * torch.arange(130)
-    poses, start = follow(mapper, along_corridor, corridor)
+    poses, start = PoseHistory(), keyframe(HERE)
+    follow(mapper, poses, start, along_corridor, corridor)
     before = mapper.map.occupied_points[:, 2]
     start.T_cw = start.T_cw @ se3_exp(torch.tensor([0.03, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
     mapper.correct(poses)
@@ -186,6 +227,28 @@ def test_number_of_stored_views_is_bounded_also_during_a_rebuild() -> None:
         assert len(drive.mapper._store) <= 20
     drive.mapper.correct(drive.poses)
     assert not is_rebuilding(drive.mapper) and drive.mapper._store.frames[-1] == 89
+
+
+def test_rebuild_adds_each_stored_view_once_if_others_are_removed_meanwhile(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rebuild begins with the 30th view; the 34th is one too many."""
+    mapper = OccupancyMapper(CONFIG.model_copy(update={"max_views": 33}), CAMERA)
+    drive, integrate, added = Drive(mapper), mapper._integrate, list[RangeView]()
+
+    def record(occupancy: OccupancyMap, position: int) -> None:
+        if occupancy is not mapper.map:
+            added.append(mapper._store.views[position])
+        integrate(occupancy, position)
+
+    monkeypatch.setattr(mapper, "_integrate", record)
+    drive.add(0, 29)
+    drive.correct()
+    drive.add(29, 33)
+    assert is_rebuilding(mapper) and len(mapper._store) == 33
+    drive.add(33, 34)
+    assert is_rebuilding(mapper) and len(mapper._store) < 33
+    while is_rebuilding(mapper):
+        drive.add(len(drive.poses), len(drive.poses) + 1)
+    assert [sum(each is view for each in added) for view in mapper._store.views] == [1] * len(mapper._store)
 
 
 @pytest.mark.parametrize("stop", [12, 32])
@@ -218,10 +281,11 @@ def test_two_runs_give_the_same_bytes() -> None:
 def test_floor_and_grid_follow_the_up_direction() -> None:
     drive = Drive(OccupancyMapper(CONFIG, CAMERA))
     assert drive.mapper.find_floor() is None and drive.mapper.grid() is None
-    drive.add(0, 12)
-    drive.mapper.up = estimate_up(gravity=torch.tensor([-1.0, 0.0, 0.0]))
+    drive.add(0, 11)
+    drive.add(11, 12, up=estimate_up(gravity=torch.tensor([1.0, 0.0, 0.0])))
+    drive.add(12, 13)  # nothing new is known
     floor = drive.mapper.find_floor()
-    assert floor is None or floor.up[0] > 0.99
+    assert floor is not None and floor.up[0] < -0.99 and drive.mapper.grid() is not None
 
 
 def test_floor_is_searched_again_when_the_number_of_views_has_doubled(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.errors import OutputError
+from v3d_torch.kernels.voxel_blocks import UNKNOWN
 from v3d_torch.occupancy import voxel_blocks
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.occupancy.octomap_file import write_octomap
@@ -85,6 +86,21 @@ def test_leaves_are_the_known_voxels(seed: int, tmp_path: Path) -> None:
     fields, leaves = read(tmp_path / "map.bt")
     assert voxels_of(leaves) == expected_voxels(occupied, free)
     assert fields["id"] == "OcTree" and float(fields["res"]) == CONFIG.voxel_size
+
+
+@pytest.mark.parametrize("voxel_size", [0.1, 0.125, 0.0625, 1 / 30])
+def test_resolution_is_the_voxel_size(voxel_size: float, tmp_path: Path) -> None:
+    write_octomap(tmp_path / "map.bt", map_of(NONE, NONE, OccupancyConfig(voxel_size=voxel_size)))
+    assert float(read(tmp_path / "map.bt")[0]["res"]) == voxel_size
+
+
+def test_voxel_with_probability_one_half_is_occupied_in_map_and_file(tmp_path: Path) -> None:
+    occupancy = map_of(torch.tensor([[1, 2, 3]]), NONE)
+    log_odds = occupancy.blocks.log_odds
+    log_odds[log_odds != UNKNOWN] = 0
+    write_octomap(tmp_path / "map.bt", occupancy)
+    assert len(occupancy.occupied_points) == 1
+    assert read(tmp_path / "map.bt")[1] == {(1, 2, 3, 1): VoxelState.OCCUPIED}
 
 
 def test_children_of_one_state_are_merged(tmp_path: Path) -> None:

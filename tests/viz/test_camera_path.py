@@ -60,6 +60,14 @@ def test_edges_join_consecutive_frames() -> None:
     assert path.edges[9:].min() == 10 and path.edges.max() == len(path.points) - 1
 
 
+def test_edges_of_a_frustum_join_its_neighbouring_vertices() -> None:
+    """The centre (0) with each corner (1 to 4), the corners in their order, and the mark (5) with the upper corners."""
+    expected = {(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (1, 4), (1, 5), (2, 5)}
+    edges = draw_path().edges
+    for first, own in ((10, edges[9:19]), (16, edges[19:])):
+        assert {tuple(sorted(edge)) for edge in (own - first).tolist()} == expected
+
+
 def rgb(colour: str) -> list[int]:
     return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
 

@@ -110,7 +110,7 @@ class OccupancyMapper:
         Args:
             poses: Poses of all frames.
         """
-        self._continue_rebuild(len(self._store))
+        self._continue_rebuild(len(self._store))  # it can contain views that are not stored any more
         self._begin_rebuild(poses)
         self._continue_rebuild(len(self._store))
         self.floor = self.find_floor() or self.floor

@@ -57,7 +57,7 @@ def write_octomap(path: StrPath, occupancy: OccupancyMap) -> None:
     tree.add_parents(codes, states, range(BITS + 1, _DEPTH + 1))
     header = (
         "# Octomap OcTree binary file\n# (feel free to add / change comments, but leave the first line as it is!)\n#\n"
-        f"id OcTree\nsize {tree.count}\nres {occupancy.config.voxel_size:g}\ndata\n"
+        f"id OcTree\nsize {tree.count}\nres {occupancy.config.voxel_size}\ndata\n"
     )
     with atomic_write(path) as temporary:
         temporary.write_bytes(header.encode("ascii") + tree.words().astype("<u2").tobytes())
@@ -115,7 +115,7 @@ class _InnerNodes:
         for height in heights:
             parents, begin = np.unique(codes >> np.uint64(3), return_index=True)
             bits = states << (codes & np.uint64(7)) * np.uint64(2)
-            word = np.bitwise_or.reduceat(bits, begin) if len(codes) else bits
+            word = np.bitwise_or.reduceat(bits, begin)
             merged = (word == 0x5555 * _FREE) | (word == 0x5555 * _OCCUPIED)
             self.count += len(parents) - 8 * int(merged.sum())
             self._firsts.append(parents[~merged] << np.uint64(3 * height))
