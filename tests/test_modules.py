@@ -57,6 +57,10 @@ def fill(inputs: Inputs, masks: dict[str, str], filler: float) -> Inputs:
     return filled
 
 
+def mask_names(case: Case) -> list[str]:
+    return [name for name, each in case.inputs(1, 1, torch.float64).items() if each.dtype == torch.bool]
+
+
 # ---------------------------------------------------------------- all modules
 
 
@@ -226,6 +230,23 @@ def test_optional_input_can_have_the_batch_dimension(title: str) -> None:
     else:
         name, value = "fixed", torch.arange(5 if title == "PoseGraphOptimiser" else 3) == 0
     assert_any_input_can_have_the_batch_dimension(case, inputs | {name: value}, name)
+
+
+MASKS = [
+    *((title, name) for title, case in (CASES | FUNCTION_CASES).items() for name in mask_names(case)),
+    *((title, "fixed") for title in ("BundleAdjuster", "ReadoutEstimator", "PoseGraphOptimiser")),
+    *(("align_depth", name) for name in ("static_a", "static_b")),
+]
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.float32])
+@pytest.mark.parametrize(("title", "name"), MASKS)
+def test_mask_of_another_type_than_bool_is_rejected(title: str, name: str, dtype: torch.dtype) -> None:
+    case = (CASES | FUNCTION_CASES)[title]
+    inputs = case.inputs(2, 12, torch.float32)
+    mask = inputs.get(name, torch.ones(1, dtype=torch.bool)).to(dtype)
+    with pytest.raises(v3d.InputError, match=rf"^{name} has the type {dtype}; give a mask of type torch\.bool$"):
+        case.function(**inputs | {name: mask})
 
 
 # ---------------------------------------------------------------- gradients

@@ -15,6 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
@@ -99,8 +100,9 @@ def optimise_pose_graph(
         Poses without a path of edges to a fixed pose are determined only relative to each other.
 
     Raises:
-        InputError: If ``edges`` is not int64, or has an index out of range.
+        InputError: If ``edges`` is not int64, or has an index out of range, or if a mask is not bool.
     """
+    check_masks(fixed=fixed, valid=valid)
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])

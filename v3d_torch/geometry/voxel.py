@@ -10,6 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
@@ -37,7 +38,8 @@ class Voxels(NamedTuple):
 
 def _voxel_pool_compiled(points: Tensor, valid: Tensor, size: float) -> Voxels:
     is_cloud = points.dtype == torch.float32 and points.ndim == 3 and points.shape[2] == 3
-    if not is_cloud or points.shape[:2] != valid.shape or not size > 0:
+    is_mask = valid.dtype == torch.bool and points.shape[:2] == valid.shape
+    if not is_cloud or not is_mask or not size > 0:
         return NotImplemented
     mask, coordinates = valid.numpy(), to_array(points)
     limits = np.float32(size), float(_MAX_VOXELS)
@@ -70,8 +72,10 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
 
     Raises:
         ConfigError: If ``size`` is not positive.
-        InputError: If a valid point is not finite, or the points are too far apart to number the voxels between them.
+        InputError: If a valid point is not finite, the points are too far apart to number the voxels between them, or
+            ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
     if not size > 0:  # also if it is NaN

@@ -117,7 +117,7 @@ def bundle_adjust(
         for integers; chi2 and costs at least in float32.
 
     Raises:
-        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range.
+        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, or if a mask is not bool.
     """
     problem, initial, valid = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid

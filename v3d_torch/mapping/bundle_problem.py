@@ -12,6 +12,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.compiler import can_read
 from v3d_torch.optim.implicit import jacobian, zero_with_gradient
@@ -211,7 +212,11 @@ def prepare_bundle(
     Returns:
         The problem and the initial state, in float64, and the mask of the observations that are not padding, bool,
         shape :math:`(..., M)`.
+
+    Raises:
+        InputError: If a mask is not bool, or an index is not int64 or out of range.
     """
+    check_masks(fixed=fixed, valid=valid)
     KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "L", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])

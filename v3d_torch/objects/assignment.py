@@ -7,6 +7,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.kernels.compiler import can_read
 
 
@@ -24,7 +25,11 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
 
     Returns:
         Index of the object that each instance continues, from 0 to T - 1, or -1; int64, shape :math:`(B, N)`.
+
+    Raises:
+        InputError: If a mask is not bool.
     """
+    check_masks(tracked=tracked, present=present)
     KORNIA_CHECK_SHAPE(log_ratio, ["B", "T", "N"])
     gain = log_ratio.detach().to(torch.float64).clamp(min=0)
     if tracked is not None:

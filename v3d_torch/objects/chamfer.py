@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import working_dtype
 from v3d_torch.kernels.compiler import can_read
 
@@ -51,8 +52,9 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
         ``p`` and ``q`` if the nearest points are unique.
 
     Raises:
-        InputError: If a valid point is not finite.
+        InputError: If a valid point is not finite, or a mask is not bool.
     """
+    check_masks(p_valid=p_valid, q_valid=q_valid)
     KORNIA_CHECK_SHAPE(p, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(q, [str(p.shape[0]), "M", "3"])
     p_valid, q_valid = _mask(p, p_valid), _mask(q, q_valid)

@@ -8,6 +8,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import without_autocast, working_dtype
 from v3d_torch.objects.chamfer import chamfer_distance
 
@@ -54,8 +55,9 @@ def intra_object_motion(
         transform as `chamfer_distance` is; at a distance of 0, which is a kink, the gradient is set to 0.
 
     Raises:
-        InputError: If a valid point is not finite.
+        InputError: If a valid point is not finite, or a mask is not bool.
     """
+    check_masks(previous_valid=previous_valid, current_valid=current_valid)
     dtype = previous.dtype
     previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))
     if T_current_previous is not None:

@@ -9,6 +9,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import VotingConfig
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import working_dtype
 
 _STATIC_VOTER_RATIO = 0.5
@@ -62,7 +63,11 @@ def hough_vote(
     Returns:
         Votes. ``change`` is differentiable in both inputs of centroids. With a temperature, ``pair`` and ``votes`` are
         differentiable in centroids, and in thresholds and temperature if these are tensors.
+
+    Raises:
+        InputError: If ``present`` is not bool.
     """
+    check_masks(present=present)
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
     KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from v3d_torch.config import RollingShutterConfig
 from v3d_torch.features.features import Features
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.geometry.precision import result_dtype
@@ -162,7 +163,11 @@ def compensate_rolling_shutter(
     Returns:
         Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv``, float32 for
         integers, and of shape :math:`(*, N, 2)`; 0 for padding.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]
     each = None if valid is None else valid[..., None]
     observed = fill_padding(uv, each, 0.0)
