@@ -193,7 +193,7 @@ GEOMETRIC = {
 }
 
 
-@pytest.mark.parametrize("case", GEOMETRIC.values(), ids=GEOMETRIC)
+@pytest.mark.parametrize("case", (CASES | FUNCTION_CASES).values(), ids=CASES | FUNCTION_CASES)
 def test_integers_give_the_results_of_equal_floating_point_numbers(case: Case) -> None:
     inputs = {
         name: each.round() if each.is_floating_point() else each

@@ -10,7 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
@@ -48,7 +48,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     along columns. The paper's equation is the case ``edge_ratio=inf`` on an image without holes.
 
     Args:
-        depth: Depth, metres, floating point, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
+        depth: Depth, metres, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
             and depth beyond 100 km count as missing, too. Half precision is converted to float32.
         kernel_size: Side of the window, pixels, odd.
         sigma: Standard deviation of the Gaussian, pixels.
@@ -56,8 +56,8 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
             ``math.inf`` disables the gates.
 
     Returns:
-        Smoothed depth, metres, shape and dtype of ``depth``; exactly 0 for pixels without measurement. Differentiable
-        in ``depth``, with the gates :math:`g` held constant.
+        Smoothed depth, metres, shape and dtype of ``depth``, float32 for integers; exactly 0 for pixels without
+        measurement. Differentiable in ``depth``, with the gates :math:`g` held constant.
 
     Raises:
         ConfigError: If the window has no centre pixel.
@@ -73,7 +73,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
         margin = min(radius, top)
         rows = slice(top - margin, min(top + _STRIP_HEIGHT + radius, height))
         strips.append(_smooth(wide[..., rows, :], taps, edge_ratio)[..., margin : margin + _STRIP_HEIGHT, :])
-    return torch.cat(strips, dim=-2).to(depth.dtype)
+    return torch.cat(strips, dim=-2).to(result_dtype(depth.dtype))
 
 
 def _gaussian(kernel_size: int, sigma: float) -> tuple[float, ...]:

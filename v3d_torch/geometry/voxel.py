@@ -11,7 +11,7 @@ from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.argument_checks import check_masks
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
@@ -24,7 +24,7 @@ class Voxels(NamedTuple):
 
     Attributes:
         means: Mean of the points in each voxel, metres, shape :math:`(B, M, 3)`; 0 in the padding. Sums are
-            in double precision, results in the dtype of the points.
+            in double precision, results in the dtype of the points, float32 for integers.
         valid: Mask of the voxels that are not padding, bool, shape :math:`(B, M)`.
         counts: Number of points in each voxel, int64, shape :math:`(B, M)`; 0 in the padding.
         voxel_index: Index of each point's voxel within its cloud, int64, shape :math:`(B, N)`; -1 for invalid points.
@@ -62,7 +62,7 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     does not depend on the cloud.
 
     Args:
-        points: Points, metres, floating point, shape :math:`(B, N, 3)`.
+        points: Points, metres, shape :math:`(B, N, 3)`.
         valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`; the values of padding are ignored.
         size: Side of a voxel, metres.
 
@@ -91,7 +91,7 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     sums = [axis.new_zeros(batch, voxels + 1).scatter_add(1, slot, axis) for axis in axes]
     counts = slot.new_zeros(batch, voxels + 1).scatter_add(1, slot, valid.to(torch.int64))[:, 1:]
     means = torch.stack(sums, dim=2)[:, 1:] / counts.clamp(min=1)[..., None]
-    return Voxels(means.to(points.dtype), counts > 0, counts, voxel_index)
+    return Voxels(means.to(result_dtype(points.dtype)), counts > 0, counts, voxel_index)
 
 
 def _number_voxels(points: Tensor, valid: Tensor, size: float) -> tuple[Tensor, Tensor]:

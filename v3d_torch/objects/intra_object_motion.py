@@ -9,7 +9,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
-from v3d_torch.geometry.precision import without_autocast, working_dtype
+from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.objects.chamfer import chamfer_distance
 
 
@@ -18,7 +18,7 @@ class Deformation(NamedTuple):
 
     Attributes:
         distance: Root-mean-square nearest-neighbour distance, :math:`\sqrt{D / 2}` with D the Chamfer distance, metres,
-            dtype of the clouds, shape :math:`(B,)`; NaN if one of the two clouds is empty.
+            dtype of the clouds, float32 for integers, shape :math:`(B,)`; NaN if one of the two clouds is empty.
         deforming: Mask of the objects whose distance is at least the threshold, bool, shape :math:`(B,)`; False if the
             distance is NaN.
     """
@@ -42,7 +42,7 @@ def intra_object_motion(
     the frame of its own camera together with ``T_current_previous``.
 
     Args:
-        previous: Clouds at the earlier time, metres, floating point, shape :math:`(B, N, 3)`.
+        previous: Clouds at the earlier time, metres, shape :math:`(B, N, 3)`.
         current: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
         distance_threshold: Minimum distance of a deforming object, metres.
         previous_valid: Mask of the previous points that are not padding, bool, shape :math:`(B, N)`; None for all.
@@ -66,7 +66,7 @@ def intra_object_motion(
     # torch.where evaluates both branches: the 1 keeps the gradient of the unused branch finite.
     is_zero = mean_square == 0
     distance = torch.where(is_zero, 0, torch.where(is_zero, 1, mean_square).sqrt())
-    return Deformation(distance.to(dtype), deforming=distance >= distance_threshold)
+    return Deformation(distance.to(result_dtype(dtype)), deforming=distance >= distance_threshold)
 
 
 def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
