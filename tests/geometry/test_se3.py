@@ -155,6 +155,13 @@ def test_exp_and_log_gradcheck(angle: float) -> None:
     assert torch.autograd.gradcheck(lambda x: se3_log(se3_exp(x)), xi)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0])
+def test_exp_and_log_have_second_derivatives(angle: float) -> None:
+    xi = tangents(angle, 2).requires_grad_()
+    assert torch.autograd.gradgradcheck(se3_exp, xi)
+    assert torch.autograd.gradgradcheck(lambda x: se3_log(se3_exp(x)), xi)
+
+
 def test_rotations_that_are_not_finite_do_not_affect_the_others_of_a_batch() -> None:
     T = se3_exp(tangents(1.0, 3))
     T[1, 0, 0] = torch.nan

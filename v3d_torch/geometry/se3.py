@@ -119,7 +119,9 @@ def se3_exp(xi: Tensor) -> Tensor:
     dtype, xi = result_dtype(xi.dtype), xi.to(working_dtype(xi.dtype))
     X = hat(xi)
     # Below the small angle the coefficients are constant to float64, and are multiplied by high powers of the angle.
-    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=SMALL_ANGLE)
+    # The square root of 0 would make second derivatives NaN.
+    square = xi[..., 3:].square().sum(dim=-1)[..., None, None]
+    angle = torch.where(square < SMALL_ANGLE**2, SMALL_ANGLE**2, square).sqrt()
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
     X2 = X @ X
