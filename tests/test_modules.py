@@ -249,6 +249,21 @@ def test_mask_of_another_type_than_bool_is_rejected(title: str, name: str, dtype
         case.function(**inputs | {name: mask})
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize(
+    ("title", "name"),
+    [
+        *product(("BundleAdjuster", "ReadoutEstimator"), ("T_cw", "points")),
+        *product(("PoseGraphOptimiser",), ("T_wc", "T_ij")),
+    ],
+)
+def test_poses_and_landmarks_that_are_not_finite_are_rejected(title: str, name: str, value: float) -> None:
+    inputs = CASES[title].inputs(1, 30, torch.float64)
+    inputs[name][0, 1] = value
+    with pytest.raises(v3d.InputError, match=f"^{name} has a value that is not finite"):
+        CASES[title].function(**inputs)
+
+
 # ---------------------------------------------------------------- gradients
 
 

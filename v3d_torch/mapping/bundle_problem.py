@@ -25,7 +25,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import common_batch, fill_indices, fill_padding
+from v3d_torch.runtime.batches import check_finite, common_batch, fill_indices, fill_padding
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -214,7 +214,7 @@ def prepare_bundle(
         shape :math:`(..., M)`.
 
     Raises:
-        InputError: If a mask is not bool, or an index is not int64 or out of range.
+        InputError: If a mask is not bool, an index is not int64 or out of range, or a pose or point is not finite.
     """
     check_masks(fixed=fixed, valid=valid)
     KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])
@@ -222,6 +222,7 @@ def prepare_bundle(
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])
     KORNIA_CHECK_SHAPE(point, ["*", str(pose.shape[-1])])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    check_finite(T_cw=T_cw, points=points)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)

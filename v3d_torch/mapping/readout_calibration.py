@@ -90,7 +90,8 @@ def estimate_readout(
         uniform motion, ``seconds`` stays nearly the same and ``information`` is discounted.
 
     Raises:
-        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, or if a mask is not bool.
+        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, or if a
+            pose or landmark is not finite.
     """
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
