@@ -191,11 +191,13 @@ def test_attributes_of_a_replaced_stage_are_those_of_the_stage() -> None:
 
 
 @pytest.mark.parametrize("stage", [5, None, torch.zeros(2), "smooth"])
-def test_stage_that_cannot_be_called_is_rejected_at_once(stage: Any) -> None:
+@pytest.mark.parametrize("name", STAGES)
+def test_stage_that_cannot_be_called_is_rejected_at_once(name: str, stage: Any) -> None:
     slam = make_slam()
-    with pytest.raises(ConfigError, match=r"^smooth_depth was replaced by a .*, which cannot be called; set a stage$"):
-        slam.smooth_depth = stage
-    assert isinstance(slam.smooth_depth, DepthSmoother)
+    original = getattr(slam, name)
+    with pytest.raises(ConfigError, match=f"^{name} was replaced by a .*, which cannot be called; set a stage$"):
+        setattr(slam, name, stage)
+    assert getattr(slam, name) is original
 
 
 @pytest.mark.parametrize(
