@@ -6,6 +6,7 @@ The test file of each module compares its numbers with other libraries.
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from collections.abc import Callable
 from itertools import product
@@ -247,6 +248,23 @@ def test_mask_of_another_type_than_bool_is_rejected(title: str, name: str, dtype
     mask = inputs.get(name, torch.ones(1, dtype=torch.bool)).to(dtype)
     with pytest.raises(v3d.InputError, match=rf"^{name} has the type {dtype}; give a mask of type torch\.bool$"):
         case.function(**inputs | {name: mask})
+
+
+NUMBERS = [
+    ("DepthSmoother", "sigma"),
+    *product(("PoseRefiner", "BundleAdjuster", "ReadoutEstimator"), ("pixel_sigma", "inverse_depth_sigma")),
+    ("PoseRefiner", "rounds"),
+    *product(("EssentialRANSAC", "PnPRANSAC"), ("threshold", "iterations")),
+]
+
+
+@pytest.mark.parametrize("number", [0, -1, math.nan])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("title", "name"), NUMBERS)
+def test_number_that_is_not_positive_is_rejected(title: str, name: str, dtype: torch.dtype, number: float) -> None:
+    inputs = CASES[title].inputs(2, 12, dtype)
+    with pytest.raises(v3d.ConfigError, match=f"^{name} is {number}; give a number above 0$"):
+        CASES[title].function(**inputs | {name: number})
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])

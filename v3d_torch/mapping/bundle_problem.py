@@ -215,6 +215,7 @@ def prepare_bundle(
 
     Raises:
         InputError: If a mask is not bool, an index is not int64 or out of range, or a pose or point is not finite.
+        ConfigError: If a standard deviation that is a number is not positive.
     """
     check_masks(fixed=fixed, valid=valid)
     KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])

@@ -92,6 +92,7 @@ def estimate_readout(
     Raises:
         InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, or if a
             pose or landmark is not finite.
+        ConfigError: If a standard deviation that is a number is not positive.
     """
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])

@@ -15,7 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
@@ -181,6 +181,7 @@ def refine_pose(
 
     Raises:
         InputError: If ``valid`` is not bool.
+        ConfigError: If ``rounds``, or a standard deviation that is a number, is not positive.
 
     Example:
         Learn the weights of features through the poses of 32 frames:
@@ -201,6 +202,7 @@ def refine_pose(
         ...     optimiser.step()
     """
     check_masks(valid=valid)
+    check_positive(rounds=rounds)
     KORNIA_CHECK_SHAPE(T_cw, ["*", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
