@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
@@ -146,6 +147,20 @@ def test_functions_accept_any_batch_shape() -> None:
     assert invert(T).shape == (2, 3, 4, 4)
     assert se3_log(T).shape == (2, 3, 6)
     assert torch.equal(se3_log(T)[1, 2], se3_log(T[1, 2]))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(5,), (6, 1), ()])
+def test_tangent_vectors_of_another_shape_are_rejected(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    with pytest.raises(ShapeError):
+        se3_exp(torch.zeros(shape, dtype=dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(3, 3), (16,), (4, 4, 3), (2, 8)])
+def test_motions_of_another_shape_are_rejected(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    with pytest.raises(ShapeError):
+        se3_log(torch.zeros(shape, dtype=dtype))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])
