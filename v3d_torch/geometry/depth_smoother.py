@@ -71,7 +71,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     taps, height = _gaussian(kernel_size, sigma), depth.shape[-2]
     wide = depth.to(working_dtype(depth.dtype))  # half precision cannot represent the placeholder
     strips = []
-    for top in range(0, height, _STRIP_HEIGHT):
+    for top in range(0, max(height, 1), _STRIP_HEIGHT):  # one empty strip of an image without rows
         margin = min(radius, top)
         rows = slice(top - margin, min(top + _STRIP_HEIGHT + radius, height))
         strips.append(_smooth(wide[..., rows, :], taps, edge_ratio)[..., margin : margin + _STRIP_HEIGHT, :])
