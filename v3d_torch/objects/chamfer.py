@@ -52,7 +52,7 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
         two clouds is empty. Differentiable in ``p`` and ``q`` if the nearest points are unique.
 
     Raises:
-        InputError: If a valid point is not finite, or a mask is not bool.
+        InputError: If a coordinate of a valid point is not finite or exceeds 1e18 m, or if a mask is not bool.
     """
     check_masks(p_valid=p_valid, q_valid=q_valid)
     KORNIA_CHECK_SHAPE(p, ["B", "N", "3"])
@@ -142,7 +142,10 @@ def _nearest_points(points: NDArray[np.floating], sizes: NDArray[np.int64]) -> N
     """
     nearest = np.arange(len(points))
     if not np.abs(points).max(initial=0) < _MAX_COORDINATE:
-        raise InputError("chamfer_distance: a valid point is not finite; mark points without depth as invalid")
+        raise InputError(
+            f"chamfer_distance: a valid point is not finite, or farther away than {_MAX_COORDINATE:g} m; mark points"
+            " without depth as invalid"
+        )
     batch = len(sizes) // 2
     ends = sizes.cumsum()
     if points.dtype != np.float32 and len(points):

@@ -55,7 +55,7 @@ def intra_object_motion(
         transform as `chamfer_distance` is; at a distance of 0, which is a kink, the gradient is set to 0.
 
     Raises:
-        InputError: If a valid point is not finite, or a mask is not bool.
+        InputError: If a coordinate of a valid point is not finite or exceeds 1e18 m, or if a mask is not bool.
     """
     check_masks(previous_valid=previous_valid, current_valid=current_valid)
     dtype = previous.dtype
