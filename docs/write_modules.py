@@ -14,8 +14,9 @@ PAGE = ROOT / "docs" / "modules.md"
 HEAD = """<!-- Written by docs/write_modules.py, which runs every function. -->
 # Functions of tensors
 
-These functions, and the modules that call them, run on the device of their inputs and return their dtype.
-`docs/write_modules.py` measures the table by running each of them on a small batch; a test compares the page with it.
+These functions, and the modules that call them, run on the device of their inputs and return their dtype, float32 for
+integers. `docs/write_modules.py` measures the table by running each of them on a small batch; a test compares the page
+with it.
 
 | column | the function |
 |---|---|

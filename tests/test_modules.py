@@ -6,6 +6,7 @@ The test file of each module compares its numbers with other libraries.
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from collections.abc import Callable
 from itertools import product
@@ -55,6 +56,10 @@ def fill(inputs: Inputs, masks: dict[str, str], filler: float) -> Inputs:
         largest = 255 if inputs[name].dtype == torch.uint8 else 2**40
         filled[name][~inputs[mask]] = filler if inputs[name].is_floating_point() else largest
     return filled
+
+
+def mask_names(case: Case) -> list[str]:
+    return [name for name, each in case.inputs(1, 1, torch.float64).items() if each.dtype == torch.bool]
 
 
 # ---------------------------------------------------------------- all modules
@@ -189,7 +194,7 @@ GEOMETRIC = {
 }
 
 
-@pytest.mark.parametrize("case", GEOMETRIC.values(), ids=GEOMETRIC)
+@pytest.mark.parametrize("case", (CASES | FUNCTION_CASES).values(), ids=CASES | FUNCTION_CASES)
 def test_integers_give_the_results_of_equal_floating_point_numbers(case: Case) -> None:
     inputs = {
         name: each.round() if each.is_floating_point() else each
@@ -226,6 +231,55 @@ def test_optional_input_can_have_the_batch_dimension(title: str) -> None:
     else:
         name, value = "fixed", torch.arange(5 if title == "PoseGraphOptimiser" else 3) == 0
     assert_any_input_can_have_the_batch_dimension(case, inputs | {name: value}, name)
+
+
+MASKS = [
+    *((title, name) for title, case in (CASES | FUNCTION_CASES).items() for name in mask_names(case)),
+    *((title, "fixed") for title in ("BundleAdjuster", "ReadoutEstimator", "PoseGraphOptimiser")),
+    *(("align_depth", name) for name in ("static_a", "static_b")),
+]
+
+
+@pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.float32])
+@pytest.mark.parametrize(("title", "name"), MASKS)
+def test_mask_of_another_type_than_bool_is_rejected(title: str, name: str, dtype: torch.dtype) -> None:
+    case = (CASES | FUNCTION_CASES)[title]
+    inputs = case.inputs(2, 12, torch.float32)
+    mask = inputs.get(name, torch.ones(1, dtype=torch.bool)).to(dtype)
+    with pytest.raises(v3d.InputError, match=rf"^{name} has the type {dtype}; give a mask of type torch\.bool$"):
+        case.function(**inputs | {name: mask})
+
+
+NUMBERS = [
+    ("DepthSmoother", "sigma"),
+    *product(("PoseRefiner", "BundleAdjuster", "ReadoutEstimator"), ("pixel_sigma", "inverse_depth_sigma")),
+    ("PoseRefiner", "rounds"),
+    *product(("EssentialRANSAC", "PnPRANSAC"), ("threshold", "iterations")),
+]
+
+
+@pytest.mark.parametrize("number", [0, -1, math.nan])
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize(("title", "name"), NUMBERS)
+def test_number_that_is_not_positive_is_rejected(title: str, name: str, dtype: torch.dtype, number: float) -> None:
+    inputs = CASES[title].inputs(2, 12, dtype)
+    with pytest.raises(v3d.ConfigError, match=f"^{name} is {number}; give a number above 0$"):
+        CASES[title].function(**inputs | {name: number})
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize(
+    ("title", "name"),
+    [
+        *product(("BundleAdjuster", "ReadoutEstimator"), ("T_cw", "points")),
+        *product(("PoseGraphOptimiser",), ("T_wc", "T_ij")),
+    ],
+)
+def test_poses_and_landmarks_that_are_not_finite_are_rejected(title: str, name: str, value: float) -> None:
+    inputs = CASES[title].inputs(1, 30, torch.float64)
+    inputs[name][0, 1] = value
+    with pytest.raises(v3d.InputError, match=f"^{name} has a value that is not finite"):
+        CASES[title].function(**inputs)
 
 
 # ---------------------------------------------------------------- gradients

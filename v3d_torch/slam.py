@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from v3d_torch.backend.back_end import BackEnd
@@ -197,6 +198,7 @@ class V3DSLAM(FramePreprocessor):
         self.advance_predictions()
         return self.track(preprocessed)
 
+    @torch.no_grad()
     def track(self, preprocessed: PreprocessedFrame) -> FrameResult:
         """Track the camera and the objects in the next frame, and extend the map.
 

@@ -65,6 +65,15 @@ def test_run_in_a_new_process_finds_the_stage_by_pythonpath(sequence: Path, tmp_
     assert len(masks) == FRAMES and (masks[0][:8, :8] == 255).all() and (masks[0] == 0).any()
 
 
+def test_network_in_place_of_a_stage_draws_the_figures_too(sequence: Path, tmp_path: Path) -> None:
+    own = write_own_stages(tmp_path / "own")
+    overrides = ("--set", SEGMENT, "--set", f"stages.smooth_depth={MODULE}:Network")
+    path = os.pathsep.join([str(own), os.environ.get("PYTHONPATH", "")])
+    done = call("--seq", sequence, "--out", tmp_path / "out", *overrides, cwd=tmp_path, PYTHONPATH=path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "figures" / "clusters.png").is_file()
+
+
 def test_missing_module_is_one_line_before_the_run(sequence: Path, tmp_path: Path) -> None:
     done = call_here("--seq", sequence, "--out", tmp_path / "out", "--set", "stages.odometry=no_lab:PnP", cwd=tmp_path)
     assert_error_line(done, "stages.odometry=no_lab:PnP: the module no_lab cannot be imported", "PYTHONPATH")

@@ -123,6 +123,14 @@ def test_module_on_a_batch_equals_the_function_on_each_image() -> None:
     assert torch.equal(smoothed, each)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(1, 1, 0, 5), (1, 1, 4, 0), (0, 1, 4, 5)])
+def test_image_without_pixels_stays_as_it_is(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    depth = torch.zeros(shape, dtype=dtype)
+    smoothed = smooth_depth(depth)
+    assert smoothed.shape == shape and smoothed.dtype == dtype
+
+
 def test_default_dtype_does_not_change_the_result() -> None:
     given = stepped_depth(30, 40, torch.float32)
     expected = smooth_depth(given)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
@@ -148,11 +149,32 @@ def test_functions_accept_any_batch_shape() -> None:
     assert torch.equal(se3_log(T)[1, 2], se3_log(T[1, 2]))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(5,), (6, 1), ()])
+def test_tangent_vectors_of_another_shape_are_rejected(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    with pytest.raises(ShapeError):
+        se3_exp(torch.zeros(shape, dtype=dtype))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("shape", [(3, 3), (16,), (4, 4, 3), (2, 8)])
+def test_motions_of_another_shape_are_rejected(shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    with pytest.raises(ShapeError):
+        se3_log(torch.zeros(shape, dtype=dtype))
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 3.0])
 def test_exp_and_log_gradcheck(angle: float) -> None:
     xi = tangents(angle, 2).requires_grad_()
     assert torch.autograd.gradcheck(se3_exp, xi)
     assert torch.autograd.gradcheck(lambda x: se3_log(se3_exp(x)), xi)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0])
+def test_exp_and_log_have_second_derivatives(angle: float) -> None:
+    xi = tangents(angle, 2).requires_grad_()
+    assert torch.autograd.gradgradcheck(se3_exp, xi)
+    assert torch.autograd.gradgradcheck(lambda x: se3_log(se3_exp(x)), xi)
 
 
 def test_rotations_that_are_not_finite_do_not_affect_the_others_of_a_batch() -> None:

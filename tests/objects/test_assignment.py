@@ -9,6 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from v3d_torch.errors import InputError
 from v3d_torch.objects.assignment import match_instances
 
 
@@ -23,6 +24,12 @@ def test_assignment_has_the_largest_sum_of_all_permutations(values: list[float])
 def test_pair_without_positive_ratio_is_not_matched() -> None:
     ratio = torch.tensor([[[0.0, -1.0, -torch.inf], [-torch.inf, -2.0, 0.5]]])
     assert match_instances(ratio).tolist() == [[-1, -1, 1]]
+
+
+@pytest.mark.parametrize("ratio", [torch.nan, torch.inf])
+def test_ratio_that_is_not_finite_is_rejected(ratio: float) -> None:
+    with pytest.raises(InputError, match=r"^log_ratio has NaN or plus infinity; give finite ratios, or -inf for imp"):
+        match_instances(torch.tensor([[[0.0, ratio], [1.0, 2.0]]]))
 
 
 @pytest.mark.parametrize("padding", [torch.nan, torch.inf, -torch.inf])

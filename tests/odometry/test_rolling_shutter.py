@@ -12,6 +12,7 @@ from helpers.rolling_camera import AT_REST, CAMERA, KINECT, VELOCITY, features_o
 from torch import Tensor
 
 from v3d_torch.config import Config
+from v3d_torch.errors import ConfigError
 from v3d_torch.odometry.rolling_shutter import (
     GLOBAL_SHUTTER,
     Readout,
@@ -77,6 +78,13 @@ def test_only_the_readout_can_have_batch_dimensions() -> None:
 def test_compensation_of_no_features_is_empty() -> None:
     observed = observe_rolling(points_in_view(), VELOCITY, KINECT.seconds)[torch.zeros(0, dtype=torch.int64)]
     assert len(compensate_features(observed, VELOCITY, KINECT, CAMERA)) == 0
+
+
+@pytest.mark.parametrize("height", [1, 0, -480])
+def test_image_with_less_than_two_rows_is_rejected(height: int) -> None:
+    uv, each = torch.zeros(3, 2, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    with pytest.raises(ConfigError, match=f"^height is {height}; give at least 2 rows$"):
+        compensate_rolling_shutter(uv, each, each, VELOCITY, 0.02, CAMERA.K, height, uv)
 
 
 def test_readout_of_a_camera_is_certain_if_given_else_the_prior() -> None:

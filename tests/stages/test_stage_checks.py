@@ -154,6 +154,31 @@ def test_built_in_stages_are_not_wrapped() -> None:
     assert not any(isinstance(value, ReplacedStage) for value in vars(slam).values())
 
 
+class ScaledDepth(torch.nn.Module):
+    """Network with a parameter."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def forward(self, depth: torch.Tensor) -> torch.Tensor:
+        return self.scale * depth
+
+
+def test_stages_with_parameters_need_no_gradients_while_frames_are_processed() -> None:
+    score = torch.nn.Parameter(torch.ones(()))
+    learned = V3DSLAM(CAMERA, lambda frame: replace(segment(frame), scores=score.expand(2)), CONFIG)
+    learned.smooth_depth = ScaledDepth()
+    learned.describe_appearance = lambda image, masks: torch.ones(len(masks), 1) * score
+    slam = make_slam()
+    slam.smooth_depth, slam.describe_appearance = torch.nn.Identity(), lambda image, masks: torch.ones(len(masks), 1)
+    for frame in FRAMES:
+        found = learned(frame)
+        assert torch.equal(found.T_wc, slam(frame).T_wc)
+        assert not found.T_wc.requires_grad and not any(each.centroid.requires_grad for each in found.objects)
+    assert learned.smooth_depth(torch.ones(1, 1, 48, 64)).requires_grad  # outside of frames, a loss can use the stage
+
+
 def test_attributes_of_a_replaced_stage_are_those_of_the_stage() -> None:
     slam = make_slam()
     module = torch.nn.Identity()
@@ -166,11 +191,13 @@ def test_attributes_of_a_replaced_stage_are_those_of_the_stage() -> None:
 
 
 @pytest.mark.parametrize("stage", [5, None, torch.zeros(2), "smooth"])
-def test_stage_that_cannot_be_called_is_rejected_at_once(stage: Any) -> None:
+@pytest.mark.parametrize("name", STAGES)
+def test_stage_that_cannot_be_called_is_rejected_at_once(name: str, stage: Any) -> None:
     slam = make_slam()
-    with pytest.raises(ConfigError, match=r"^smooth_depth was replaced by a .*, which cannot be called; set a stage$"):
-        slam.smooth_depth = stage
-    assert isinstance(slam.smooth_depth, DepthSmoother)
+    original = getattr(slam, name)
+    with pytest.raises(ConfigError, match=f"^{name} was replaced by a .*, which cannot be called; set a stage$"):
+        setattr(slam, name, stage)
+    assert getattr(slam, name) is original
 
 
 @pytest.mark.parametrize(

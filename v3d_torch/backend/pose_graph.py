@@ -15,6 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
@@ -22,7 +23,7 @@ from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
-from v3d_torch.runtime.batches import common_batch, fill_indices, fill_padding, from_rows, to_rows
+from v3d_torch.runtime.batches import check_finite, common_batch, fill_indices, fill_padding, from_rows, to_rows
 
 if TYPE_CHECKING:
     import pypose as pp
@@ -99,8 +100,10 @@ def optimise_pose_graph(
         Poses without a path of edges to a fixed pose are determined only relative to each other.
 
     Raises:
-        InputError: If ``edges`` is not int64, or has an index out of range.
+        InputError: If ``edges`` is not int64, or has an index out of range, if a mask is not bool, or if a pose is not
+            finite.
     """
+    check_masks(fixed=fixed, valid=valid)
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
@@ -238,6 +241,7 @@ def _prepare(
     if valid is not None:
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
+    check_finite(T_wc=T_wc, T_ij=T_ij)
     weights = fill_padding(weights, valid, 0.0)
     batch = common_batch(
         T_wc.shape[:-3],

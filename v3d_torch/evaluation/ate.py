@@ -10,6 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
@@ -77,7 +78,11 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
     Returns:
         ATE, metres, dtype of ``T_ec``, float32 for integers, shape :math:`(*)`; NaN without poses, or if a
         pose is not finite.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     each = None if valid is None else valid[..., None, None]

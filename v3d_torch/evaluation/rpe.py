@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.evaluation.association import Matches
 from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.runtime.batches import common_batch, mask_or_all
@@ -73,7 +74,11 @@ def rpe(
     Returns:
         Translation error, metres per ``delta``, and rotation error, degrees per ``delta``, dtype of ``T_ec``, float32
         for integers, shape :math:`(*)` each; NaN if there is no pair.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])

@@ -6,6 +6,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
@@ -43,7 +44,11 @@ def umeyama(
         float32 for integers, shape :math:`(*, 4, 4)`. Points on a line do not determine the rotation; one of the
         solutions is returned. Without points the result is the identity; points at one place do not determine the
         scale, which is then 1. It is NaN if a point is not finite.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
     each = None if valid is None else valid[..., None]

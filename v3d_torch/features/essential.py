@@ -17,6 +17,7 @@ from torch import Tensor
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
 from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
 from v3d_torch.features.usac import usac_options
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
 from v3d_torch.optim.implicit import needs_gradient
@@ -76,7 +77,13 @@ def essential_ransac(
     Returns:
         Matrices with the dtype of ``uv_a``, float32 for integers; their sign is arbitrary. No matrix is found from
         fewer than 6 pairs.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
+        ConfigError: If ``threshold`` or ``iterations`` is not positive.
     """
+    check_masks(valid=valid)
+    check_positive(threshold=threshold, iterations=iterations)
     KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])

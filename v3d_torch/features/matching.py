@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import OdometryConfig
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.kernels import descriptors as descriptor_kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.runtime.batches import common_batch
@@ -55,6 +56,8 @@ def _match_descriptors_compiled(
     if any(each.dtype != torch.uint8 or each.ndim < 2 or each.shape[-1] != _BYTES for each in (a, b)):
         return NotImplemented
     masks = [valid for valid in (a_valid, b_valid) if valid is not None]
+    if any(valid.dtype != torch.bool for valid in masks):
+        return NotImplemented
     batch = common_batch(*(each.shape[:-2] for each in (a, b)), *(valid.shape[:-1] for valid in masks))
     a, b = (each.expand(*batch, *each.shape[-2:]) for each in (a, b))
     matches = torch.full(a.shape[:-1], -1)
@@ -101,7 +104,11 @@ def match_descriptors(
     Returns:
         Row of ``b`` that each row of ``a`` matches, -1 for none, int64, shape :math:`(*, N)`. There are no matches if
         ``a`` or ``b`` has fewer than two descriptors.
+
+    Raises:
+        InputError: If a mask is not bool.
     """
+    check_masks(a_valid=a_valid, b_valid=b_valid)
     KORNIA_CHECK_SHAPE(a, ["*", "N", "D"])
     KORNIA_CHECK_SHAPE(b, ["*", "M", str(a.shape[-1])])
     distance = _pairwise_hamming_distances(a, b)

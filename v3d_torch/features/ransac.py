@@ -15,6 +15,7 @@ from torch import Tensor
 from v3d_torch.features.p3p import solve_p3p
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
 from v3d_torch.features.usac import usac_options
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
@@ -102,7 +103,13 @@ def pnp_ransac(
 
     Returns:
         Poses with the dtype of ``points``, float32 for integers. No pose is found from fewer than 6 points.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
+        ConfigError: If ``threshold`` or ``iterations`` is not positive.
     """
+    check_masks(valid=valid)
+    check_positive(threshold=threshold, iterations=iterations)
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])

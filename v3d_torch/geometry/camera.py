@@ -20,6 +20,7 @@ from v3d_torch.geometry.distortion import (
     kernel_coefficients,
     undistort_pixels,
 )
+from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.camera import Bounds, Intrinsics
 
 MAX_READOUT = 0.05
@@ -308,17 +309,17 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
     r"""Back-project a depth image: :math:`x = (u - c_x) z / f_x,\; y = (v - c_y) z / f_y` (paper, Sec. III-B.1).
 
     Args:
-        depth: Depth along z, metres, floating point, shape :math:`(B, 1, H, W)`; 0 = no measurement.
+        depth: Depth along z, metres, shape :math:`(B, 1, H, W)`; 0 = no measurement.
         rays: Viewing ray of every pixel at unit depth, shape :math:`(H, W, 3)`, or :math:`(B, H, W, 3)` for one camera
             per image; see `PinholeCamera.rays`.
 
     Returns:
-        Points in the camera frame, metres, dtype of ``depth``, shape :math:`(B, H, W, 3)`; (0, 0, 0) where the depth is
-        0, and not finite where it is not. Differentiable in ``depth`` and ``rays``.
+        Points in the camera frame, metres, dtype of ``depth``, float32 for integers, shape :math:`(B, H, W, 3)`;
+        (0, 0, 0) where the depth is 0, and not finite where it is not. Differentiable in ``depth`` and ``rays``.
     """
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     KORNIA_CHECK_SHAPE(rays, ["*", *map(str, depth.shape[2:]), "3"])
-    return rays.to(depth) * depth[:, 0, :, :, None]
+    return rays.to(depth.device, result_dtype(depth.dtype)) * depth[:, 0, :, :, None]
 
 
 class BackProjector(torch.nn.Module):

@@ -10,7 +10,8 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.argument_checks import check_positive
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
@@ -23,7 +24,7 @@ _STRIP_HEIGHT = 120
 
 def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> Tensor:
     is_image = depth.dtype == torch.float32 and depth.ndim == 4 and depth.shape[1] == 1
-    if not is_image or kernel_size < 1 or kernel_size % 2 == 0:
+    if not is_image or kernel_size < 1 or kernel_size % 2 == 0 or not sigma > 0:
         return NotImplemented
     taps = np.array(_gaussian(kernel_size, sigma), np.float32)
     limits = np.float32(edge_ratio), np.float32(_MAX_VALID_DEPTH)
@@ -48,7 +49,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     along columns. The paper's equation is the case ``edge_ratio=inf`` on an image without holes.
 
     Args:
-        depth: Depth, metres, floating point, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
+        depth: Depth, metres, shape :math:`(B, 1, H, W)`; 0 = no measurement. Negative values, NaN
             and depth beyond 100 km count as missing, too. Half precision is converted to float32.
         kernel_size: Side of the window, pixels, odd.
         sigma: Standard deviation of the Gaussian, pixels.
@@ -56,12 +57,13 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
             ``math.inf`` disables the gates.
 
     Returns:
-        Smoothed depth, metres, shape and dtype of ``depth``; exactly 0 for pixels without measurement. Differentiable
-        in ``depth``, with the gates :math:`g` held constant.
+        Smoothed depth, metres, shape and dtype of ``depth``, float32 for integers; exactly 0 for pixels without
+        measurement. Differentiable in ``depth``, with the gates :math:`g` held constant.
 
     Raises:
-        ConfigError: If the window has no centre pixel.
+        ConfigError: If the window has no centre pixel, or ``sigma`` is not positive.
     """
+    check_positive(sigma=sigma)
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     if kernel_size < 1 or kernel_size % 2 == 0:
         raise ConfigError(f"depth.kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
@@ -69,11 +71,11 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     taps, height = _gaussian(kernel_size, sigma), depth.shape[-2]
     wide = depth.to(working_dtype(depth.dtype))  # half precision cannot represent the placeholder
     strips = []
-    for top in range(0, height, _STRIP_HEIGHT):
+    for top in range(0, max(height, 1), _STRIP_HEIGHT):  # one empty strip of an image without rows
         margin = min(radius, top)
         rows = slice(top - margin, min(top + _STRIP_HEIGHT + radius, height))
         strips.append(_smooth(wide[..., rows, :], taps, edge_ratio)[..., margin : margin + _STRIP_HEIGHT, :])
-    return torch.cat(strips, dim=-2).to(depth.dtype)
+    return torch.cat(strips, dim=-2).to(result_dtype(depth.dtype))
 
 
 def _gaussian(kernel_size: int, sigma: float) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import pad
 
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import normals as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
@@ -36,18 +36,17 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     averaged depths would bend the plane.
 
     Args:
-        points: Points in the camera frame, metres, one per pixel, floating point, shape :math:`(B, H, W, 3)`; z = 0,
-            NaN or infinite for pixels without measurement.
+        points: Points in the camera frame, metres, one per pixel, shape :math:`(B, H, W, 3)`; z = 0, NaN or infinite
+            for pixels without measurement.
         radius: Half the side of the window, pixels; every other row and column of the window is used.
         edge_ratio: Pixels whose depths differ by more than this fraction lie on different surfaces.
 
     Returns:
-        Unit normals towards the camera, shape and dtype of ``points``; (0, 0, 0) unless the pixel and its four
-        neighbours are measured and lie on one surface.
+        Unit normals towards the camera, shape and dtype of ``points``, float32 for integers; (0, 0, 0) unless the pixel
+        and its four neighbours are measured and lie on one surface.
     """
     KORNIA_CHECK_SHAPE(points, ["B", "H", "W", "3"])
-    dtype = points.dtype
-    points = points.to(working_dtype(dtype))
+    dtype, points = result_dtype(points.dtype), points.to(working_dtype(points.dtype))
     z = points[..., 2]
     # The products below mask these points, too, but their derivatives would make the gradients of neighbours NaN.
     points = torch.where(points.isfinite().all(dim=-1, keepdim=True), points, 0.0)

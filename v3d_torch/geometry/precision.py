@@ -14,10 +14,10 @@ _R = TypeVar("_R")
 
 
 def working_dtype(dtype: torch.dtype) -> torch.dtype:
-    """Return the dtype in which a function computes: float32 for half precision and bfloat16, else the dtype itself.
+    """Return the dtype in which a function computes: float32 for half precision, bfloat16 and integers, else the dtype.
 
     Args:
-        dtype: Dtype of the inputs, floating point.
+        dtype: Dtype of the inputs.
     """
     return torch.promote_types(dtype, torch.float32)
 

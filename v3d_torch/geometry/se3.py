@@ -10,10 +10,11 @@ Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 
 from __future__ import annotations
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
-from v3d_torch.geometry.precision import without_autocast, working_dtype
+from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.kernels import se3 as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.kernels.reprojection import SMALL_ANGLE
@@ -111,16 +112,18 @@ def se3_exp(xi: Tensor) -> Tensor:
             + \frac{\theta - \sin\theta}{\theta^3} \hat\xi^3, \qquad \theta = \|\phi\|, \quad \xi = [\rho, \phi]
 
     Args:
-        xi: Tangent vectors ``[translation, rotation]``, metres and radians, floating point, shape :math:`(..., 6)`; any
-            rotation angle.
+        xi: Tangent vectors ``[translation, rotation]``, metres and radians, shape :math:`(..., 6)`; any rotation angle.
 
     Returns:
-        Rigid motions, dtype of ``xi``, shape :math:`(..., 4, 4)`.
+        Rigid motions, dtype of ``xi``, float32 for integers, shape :math:`(..., 4, 4)`.
     """
-    dtype, xi = xi.dtype, xi.to(working_dtype(xi.dtype))
+    KORNIA_CHECK_SHAPE(xi, ["*", "6"])
+    dtype, xi = result_dtype(xi.dtype), xi.to(working_dtype(xi.dtype))
     X = hat(xi)
     # Below the small angle the coefficients are constant to float64, and are multiplied by high powers of the angle.
-    angle = torch.linalg.vector_norm(xi[..., 3:], dim=-1)[..., None, None].clamp(min=SMALL_ANGLE)
+    # The square root of 0 would make second derivatives NaN.
+    square = xi[..., 3:].square().sum(dim=-1)[..., None, None]
+    angle = torch.where(square < SMALL_ANGLE**2, SMALL_ANGLE**2, square).sqrt()
     b = 2 * ((angle / 2).sin() / angle).square()
     c = (angle - angle.sin()) / angle**3
     X2 = X @ X
@@ -128,7 +131,7 @@ def se3_exp(xi: Tensor) -> Tensor:
 
 
 def _se3_log_compiled(T: Tensor) -> Tensor:
-    if T.dtype != torch.float64:
+    if T.dtype != torch.float64 or T.shape[-2:] != (4, 4):
         return NotImplemented
     return torch.from_numpy(kernels.logarithms(to_array(T.reshape(-1, 4, 4)))).reshape(*T.shape[:-2], 6)
 
@@ -139,13 +142,14 @@ def se3_log(T: Tensor) -> Tensor:
     """Logarithm of SE(3), the inverse of `se3_exp`.
 
     Args:
-        T: Rigid motions, floating point, shape :math:`(..., 4, 4)`.
+        T: Rigid motions, shape :math:`(..., 4, 4)`.
 
     Returns:
-        Tangent vectors ``[translation, rotation]``, metres and radians, dtype of ``T``, shape :math:`(..., 6)`, with a
-        rotation angle in [0, pi].
+        Tangent vectors ``[translation, rotation]``, metres and radians, dtype of ``T``, float32 for integers, shape
+        :math:`(..., 6)`, with a rotation angle in [0, pi].
     """
-    dtype, T = T.dtype, T.to(working_dtype(T.dtype))
+    KORNIA_CHECK_SHAPE(T, ["*", "4", "4"])
+    dtype, T = result_dtype(T.dtype), T.to(working_dtype(T.dtype))
     phi = _so3_log(T[..., :3, :3])
     square = (phi * phi).sum(dim=-1)[..., None, None]
     # torch.where evaluates both branches: the 1 keeps the unused branch and its gradient finite.

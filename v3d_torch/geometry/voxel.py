@@ -10,7 +10,8 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
@@ -23,7 +24,7 @@ class Voxels(NamedTuple):
 
     Attributes:
         means: Mean of the points in each voxel, metres, shape :math:`(B, M, 3)`; 0 in the padding. Sums are
-            in double precision, results in the dtype of the points.
+            in double precision, results in the dtype of the points, float32 for integers.
         valid: Mask of the voxels that are not padding, bool, shape :math:`(B, M)`.
         counts: Number of points in each voxel, int64, shape :math:`(B, M)`; 0 in the padding.
         voxel_index: Index of each point's voxel within its cloud, int64, shape :math:`(B, N)`; -1 for invalid points.
@@ -37,7 +38,8 @@ class Voxels(NamedTuple):
 
 def _voxel_pool_compiled(points: Tensor, valid: Tensor, size: float) -> Voxels:
     is_cloud = points.dtype == torch.float32 and points.ndim == 3 and points.shape[2] == 3
-    if not is_cloud or points.shape[:2] != valid.shape or not size > 0:
+    is_mask = valid.dtype == torch.bool and points.shape[:2] == valid.shape
+    if not is_cloud or not is_mask or not size > 0:
         return NotImplemented
     mask, coordinates = valid.numpy(), to_array(points)
     limits = np.float32(size), float(_MAX_VOXELS)
@@ -60,7 +62,7 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     does not depend on the cloud.
 
     Args:
-        points: Points, metres, floating point, shape :math:`(B, N, 3)`.
+        points: Points, metres, shape :math:`(B, N, 3)`.
         valid: Mask of the points that are not padding, bool, shape :math:`(B, N)`; the values of padding are ignored.
         size: Side of a voxel, metres.
 
@@ -70,8 +72,10 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
 
     Raises:
         ConfigError: If ``size`` is not positive.
-        InputError: If a valid point is not finite, or the points are too far apart to number the voxels between them.
+        InputError: If a valid point is not finite, the points are too far apart to number the voxels between them, or
+            ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
     if not size > 0:  # also if it is NaN
@@ -87,7 +91,7 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     sums = [axis.new_zeros(batch, voxels + 1).scatter_add(1, slot, axis) for axis in axes]
     counts = slot.new_zeros(batch, voxels + 1).scatter_add(1, slot, valid.to(torch.int64))[:, 1:]
     means = torch.stack(sums, dim=2)[:, 1:] / counts.clamp(min=1)[..., None]
-    return Voxels(means.to(points.dtype), counts > 0, counts, voxel_index)
+    return Voxels(means.to(result_dtype(points.dtype)), counts > 0, counts, voxel_index)
 
 
 def _number_voxels(points: Tensor, valid: Tensor, size: float) -> tuple[Tensor, Tensor]:

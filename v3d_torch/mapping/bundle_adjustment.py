@@ -117,7 +117,9 @@ def bundle_adjust(
         for integers; chi2 and costs at least in float32.
 
     Raises:
-        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range.
+        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, or if a
+            pose or landmark is not finite.
+        ConfigError: If a standard deviation that is a number is not positive.
     """
     problem, initial, valid = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid

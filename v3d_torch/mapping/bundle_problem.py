@@ -12,6 +12,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.compiler import can_read
 from v3d_torch.optim.implicit import jacobian, zero_with_gradient
@@ -24,7 +25,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import common_batch, fill_indices, fill_padding
+from v3d_torch.runtime.batches import check_finite, common_batch, fill_indices, fill_padding
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -211,12 +212,18 @@ def prepare_bundle(
     Returns:
         The problem and the initial state, in float64, and the mask of the observations that are not padding, bool,
         shape :math:`(..., M)`.
+
+    Raises:
+        InputError: If a mask is not bool, an index is not int64 or out of range, or a pose or point is not finite.
+        ConfigError: If a standard deviation that is a number is not positive.
     """
+    check_masks(fixed=fixed, valid=valid)
     KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "L", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])
     KORNIA_CHECK_SHAPE(point, ["*", str(pose.shape[-1])])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    check_finite(T_cw=T_cw, points=points)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)

@@ -88,6 +88,11 @@ def estimate_readout(
         shape :math:`(*)` each. They equal the inputs if the readout is known, or if the cost has no minimum because the
         camera stood still, or because other poses and landmarks explain every readout equally well. After a nearly
         uniform motion, ``seconds`` stays nearly the same and ``information`` is discounted.
+
+    Raises:
+        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, or if a
+            pose or landmark is not finite.
+        ConfigError: If a standard deviation that is a number is not positive.
     """
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])

@@ -7,6 +7,8 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.kernels.compiler import can_read
 
 
@@ -24,7 +26,11 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
 
     Returns:
         Index of the object that each instance continues, from 0 to T - 1, or -1; int64, shape :math:`(B, N)`.
+
+    Raises:
+        InputError: If a mask is not bool, or a ratio that is not padding is NaN or plus infinity.
     """
+    check_masks(tracked=tracked, present=present)
     KORNIA_CHECK_SHAPE(log_ratio, ["B", "T", "N"])
     gain = log_ratio.detach().to(torch.float64).clamp(min=0)
     if tracked is not None:
@@ -38,7 +44,13 @@ def _assign(gain: Tensor) -> Tensor:
     """Row of the highest total gain that each column gets, (B, T, N) to (B, N); -1 if its gain is 0."""
     matched = torch.full((gain.shape[0], gain.shape[2]), -1)
     for gains, matches in zip(gain, matched, strict=True):
-        rows, columns = map(torch.from_numpy, scipy.optimize.linear_sum_assignment(gains.numpy(), maximize=True))
+        try:
+            assigned = scipy.optimize.linear_sum_assignment(gains.numpy(), maximize=True)
+        except ValueError as error:  # SciPy checks the gains
+            raise InputError(
+                "log_ratio has NaN or plus infinity; give finite ratios, or -inf for impossible pairs"
+            ) from error
+        rows, columns = map(torch.from_numpy, assigned)
         matches[columns] = torch.where(gains[rows, columns] > 0, rows, -1)
     return matched
 

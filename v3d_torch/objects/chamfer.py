@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels.compiler import can_read
 
 _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
@@ -41,18 +42,19 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
     the computation, all pairs of points are compared.
 
     Args:
-        p: Point clouds P, metres, floating point, shape :math:`(B, N, 3)`.
+        p: Point clouds P, metres, shape :math:`(B, N, 3)`.
         q: Point clouds Q, metres, dtype of ``p``, shape :math:`(B, M, 3)`.
         p_valid: Mask of the points of ``p`` that are not padding, bool, shape :math:`(B, N)`; None for all.
         q_valid: Mask of the points of ``q`` that are not padding, bool, shape :math:`(B, M)`; None for all.
 
     Returns:
-        Chamfer distances, square metres, shape :math:`(B,)`; NaN if one of the two clouds is empty. Differentiable in
-        ``p`` and ``q`` if the nearest points are unique.
+        Chamfer distances, square metres, dtype of ``p``, float32 for integers, shape :math:`(B,)`; NaN if one of the
+        two clouds is empty. Differentiable in ``p`` and ``q`` if the nearest points are unique.
 
     Raises:
-        InputError: If a valid point is not finite.
+        InputError: If a coordinate of a valid point is not finite or exceeds 1e18 m, or if a mask is not bool.
     """
+    check_masks(p_valid=p_valid, q_valid=q_valid)
     KORNIA_CHECK_SHAPE(p, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(q, [str(p.shape[0]), "M", "3"])
     p_valid, q_valid = _mask(p, p_valid), _mask(q, q_valid)
@@ -70,7 +72,7 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
         _mean_square(p, q, nearest_q, p_valid, q_valid),
         _mean_square(q, p, nearest_p, q_valid, p_valid),
     ]
-    return (means[0] + means[1]).to(dtype)
+    return (means[0] + means[1]).to(result_dtype(dtype))
 
 
 def _mask(points: Tensor, valid: Tensor | None) -> Tensor:
@@ -140,7 +142,10 @@ def _nearest_points(points: NDArray[np.floating], sizes: NDArray[np.int64]) -> N
     """
     nearest = np.arange(len(points))
     if not np.abs(points).max(initial=0) < _MAX_COORDINATE:
-        raise InputError("chamfer_distance: a valid point is not finite; mark points without depth as invalid")
+        raise InputError(
+            f"chamfer_distance: a valid point is not finite, or farther away than {_MAX_COORDINATE:g} m; mark points"
+            " without depth as invalid"
+        )
     batch = len(sizes) // 2
     ends = sizes.cumsum()
     if points.dtype != np.float32 and len(points):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.kernels import dbscan as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
@@ -38,7 +39,7 @@ Pairs = tuple[Ints, Ints]
 def _dbscan_compiled(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
     if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape or not eps > 0 or min_samples < 1:
         return NotImplemented
-    if points.dtype not in (torch.float32, torch.float64):
+    if points.dtype not in (torch.float32, torch.float64) or valid.dtype != torch.bool:
         return NotImplemented
     mask, coordinates = valid.numpy(), to_array(points)
     labels = np.full(mask.shape, -1)
@@ -75,8 +76,9 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
 
     Raises:
         ConfigError: If ``eps`` or ``min_samples`` is not positive.
-        InputError: If a valid point is not finite.
+        InputError: If a valid point is not finite, or ``valid`` is not bool.
     """
+    check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
     if not eps > 0 or min_samples < 1:  # also if eps is NaN

@@ -8,7 +8,8 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.precision import without_autocast, working_dtype
+from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.objects.chamfer import chamfer_distance
 
 
@@ -17,7 +18,7 @@ class Deformation(NamedTuple):
 
     Attributes:
         distance: Root-mean-square nearest-neighbour distance, :math:`\sqrt{D / 2}` with D the Chamfer distance, metres,
-            dtype of the clouds, shape :math:`(B,)`; NaN if one of the two clouds is empty.
+            dtype of the clouds, float32 for integers, shape :math:`(B,)`; NaN if one of the two clouds is empty.
         deforming: Mask of the objects whose distance is at least the threshold, bool, shape :math:`(B,)`; False if the
             distance is NaN.
     """
@@ -41,7 +42,7 @@ def intra_object_motion(
     the frame of its own camera together with ``T_current_previous``.
 
     Args:
-        previous: Clouds at the earlier time, metres, floating point, shape :math:`(B, N, 3)`.
+        previous: Clouds at the earlier time, metres, shape :math:`(B, N, 3)`.
         current: Clouds of the same objects at the current time, shape :math:`(B, M, 3)`.
         distance_threshold: Minimum distance of a deforming object, metres.
         previous_valid: Mask of the previous points that are not padding, bool, shape :math:`(B, N)`; None for all.
@@ -54,8 +55,9 @@ def intra_object_motion(
         transform as `chamfer_distance` is; at a distance of 0, which is a kink, the gradient is set to 0.
 
     Raises:
-        InputError: If a valid point is not finite.
+        InputError: If a coordinate of a valid point is not finite or exceeds 1e18 m, or if a mask is not bool.
     """
+    check_masks(previous_valid=previous_valid, current_valid=current_valid)
     dtype = previous.dtype
     previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))
     if T_current_previous is not None:
@@ -64,7 +66,7 @@ def intra_object_motion(
     # torch.where evaluates both branches: the 1 keeps the gradient of the unused branch finite.
     is_zero = mean_square == 0
     distance = torch.where(is_zero, 0, torch.where(is_zero, 1, mean_square).sqrt())
-    return Deformation(distance.to(dtype), deforming=distance >= distance_threshold)
+    return Deformation(distance.to(result_dtype(dtype)), deforming=distance >= distance_threshold)
 
 
 def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:

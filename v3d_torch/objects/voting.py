@@ -9,7 +9,8 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import VotingConfig
-from v3d_torch.geometry.precision import working_dtype
+from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.precision import result_dtype, working_dtype
 
 _STATIC_VOTER_RATIO = 0.5
 """Maximum motion of the centroid of a voting object if the free-space check is enabled, as a fraction of the distance
@@ -20,8 +21,8 @@ class Votes(NamedTuple):
     r"""Result of a vote among K objects.
 
     Attributes:
-        votes: Number of votes for each object, :math:`V(O_i) = \sum_j I_{ij}`, dtype of the centroids, shape
-            :math:`(..., K)`.
+        votes: Number of votes for each object, :math:`V(O_i) = \sum_j I_{ij}`, dtype of the centroids, float32
+            for integers, shape :math:`(..., K)`.
         pair: Indicator :math:`I_{ij}`, the vote of object j for object i, shape :math:`(..., K, K)`; symmetric, 0 on
             the diagonal and for objects that are not present.
         change: Absolute change of the distance between objects i and j, metres, shape :math:`(..., K, K)`; 0 on the
@@ -50,7 +51,7 @@ def hough_vote(
     object.
 
     Args:
-        previous: Centroids at the earlier time, metres, floating point, shape :math:`(..., K, 3)`.
+        previous: Centroids at the earlier time, metres, shape :math:`(..., K, 3)`.
         current: Centroids at the current time, metres, dtype and shape of ``previous``.
         present: Mask of the objects that are observed at both times, bool, shape :math:`(..., K)`; the centroids of all
             others are ignored.
@@ -62,15 +63,19 @@ def hough_vote(
     Returns:
         Votes. ``change`` is differentiable in both inputs of centroids. With a temperature, ``pair`` and ``votes`` are
         differentiable in centroids, and in thresholds and temperature if these are tensors.
+
+    Raises:
+        InputError: If ``present`` is not bool.
     """
+    check_masks(present=present)
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
     KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])
     diagonal = torch.eye(present.shape[-1], dtype=torch.bool, device=present.device)
     comparable = present[..., :, None] & present[..., None, :] & ~diagonal
 
-    dtype = previous.dtype
-    previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))
+    dtype, wide = result_dtype(previous.dtype), working_dtype(previous.dtype)
+    previous, current = previous.to(wide), current.to(wide)
     change = (_pairwise_distances(current, present) - _pairwise_distances(previous, present)).abs()
     change = torch.where(comparable, change, 0)
     if temperature is None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
@@ -113,7 +114,7 @@ def align_depth(
         The motion and its quality; all NaN and not reliable if an image has no contrast or no depth.
 
     Raises:
-        InputError: If the images do not have the size of the camera.
+        InputError: If the images do not have the size of the camera, or a mask is not bool.
     """
     align = DenseAligner(config or DenseOdometryConfig(), camera)
     alignment: DenseAlignment = align(grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b)
@@ -152,6 +153,7 @@ class DenseAligner(torch.nn.Module):
         static_b: Tensor | None = None,
     ) -> DenseAlignment:
         """Align images :math:`(*, 1, H, W)`; see :func:`align_depth`."""
+        check_masks(static_a=static_a, static_b=static_b)
         images = grey_a, depth_a, grey_b, depth_b
         for image in images:
             KORNIA_CHECK_SHAPE(image, ["*", "1", str(grey_a.shape[-2]), str(grey_a.shape[-1])])

@@ -16,13 +16,18 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import RollingShutterConfig
+from v3d_torch.errors import ConfigError
 from v3d_torch.features.features import Features
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.runtime.batches import fill_padding
+
+_MIN_HEIGHT = 2
+"""Minimum number of rows: the readout is the time from the first to the last row."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +111,7 @@ def _compensate_compiled(
     is_single = uv.ndim == 2 and velocity.ndim == 1 and K.ndim == 2 and row.shape == inverse_depth.shape == uv.shape[:1]
     if not is_single or any(each.dtype != torch.float64 for each in (uv, inverse_depth, velocity, K)):
         return NotImplemented
-    if isinstance(readout, Tensor) or readout_jacobian is None or valid is not None:
+    if isinstance(readout, Tensor) or readout_jacobian is None or valid is not None or height < _MIN_HEIGHT:
         return NotImplemented
     new_uv, new_jacobian = kernels.compensate_rolling_shutter(
         to_array(uv),
@@ -154,7 +159,7 @@ def compensate_rolling_shutter(
         readout: Time from the first to the last row, seconds, a number or shape :math:`(*)`; negative if the rows are
             read from the bottom up.
         K: Camera matrix, shape :math:`(*, 3, 3)`.
-        height: Number of rows of the image.
+        height: Number of rows of the image, at least 2.
         readout_jacobian: Readout Jacobian with which ``uv`` was compensated before, for the same readout and another
             velocity; that compensation is replaced. None if ``uv`` was not compensated.
         valid: Mask of the pixels that are not padding, bool, shape :math:`(*, N)`; None for all.
@@ -162,7 +167,14 @@ def compensate_rolling_shutter(
     Returns:
         Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv``, float32 for
         integers, and of shape :math:`(*, N, 2)`; 0 for padding.
+
+    Raises:
+        InputError: If ``valid`` is not bool.
+        ConfigError: If ``height`` is less than 2.
     """
+    check_masks(valid=valid)
+    if height < _MIN_HEIGHT:
+        raise ConfigError(f"height is {height}; give at least {_MIN_HEIGHT} rows")
     seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]
     each = None if valid is None else valid[..., None]
     observed = fill_padding(uv, each, 0.0)

@@ -15,6 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
@@ -178,6 +179,10 @@ def refine_pose(
         The refined poses and their inliers, with the dtype of ``T_cw``, float32 for integers; chi2 and information at
         least in float32. A pose without measurements is the prediction.
 
+    Raises:
+        InputError: If ``valid`` is not bool.
+        ConfigError: If ``rounds``, or a standard deviation that is a number, is not positive.
+
     Example:
         Learn the weights of features through the poses of 32 frames:
 
@@ -196,6 +201,8 @@ def refine_pose(
         ...     loss.backward()
         ...     optimiser.step()
     """
+    check_masks(valid=valid)
+    check_positive(rounds=rounds)
     KORNIA_CHECK_SHAPE(T_cw, ["*", "4", "4"])
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import TrackingConfig
+from v3d_torch.geometry.argument_checks import check_positive
 from v3d_torch.kernels import whitening as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
@@ -80,7 +81,11 @@ def prepare_measurements(
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(..., M)`.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m, a number or shape :math:`(..., M)`.
         valid: Mask of the measurements that are not padding, bool, shape :math:`(..., M)`.
+
+    Raises:
+        ConfigError: If a standard deviation that is a number is not positive.
     """
+    check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
     inverse_depth = fill_padding(inverse_depth, valid, 0.0)

@@ -57,6 +57,20 @@ def fill_indices(name: str, indices: Tensor, count: int, valid: Tensor | None) -
     return indices if valid is None else torch.where(valid, indices, 0)
 
 
+def check_finite(**values: Tensor) -> None:
+    """Check that values are finite, if they can be read at once: one that is not would make every step of a solver NaN.
+
+    Args:
+        values: Values by the name of the argument, any shape.
+
+    Raises:
+        InputError: If a value is NaN or infinite.
+    """
+    for name, each in values.items():
+        if can_read(each) and not bool(each.isfinite().all()):
+            raise InputError(f"{name} has a value that is not finite; give finite numbers, also in the padding")
+
+
 def common_batch(*batches: torch.Size) -> torch.Size:
     """Return the broadcast shape of several batch shapes; faster than torch if those with dimensions are equal."""
     first, *others = {batch for batch in batches if batch} or {torch.Size()}

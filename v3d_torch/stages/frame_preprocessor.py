@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import torch
+
 from v3d_torch.config import Config
 from v3d_torch.features.orb import ORB
 from v3d_torch.frame_result import Extraction, PreprocessedFrame, Segmentation
@@ -80,6 +82,7 @@ class FramePreprocessor(ReplaceableStages):
         """
         check_frame(frame, self.camera)
 
+    @torch.no_grad()
     def segment_instances(
         self, frame: RGBDFrame, prediction: PosePrediction | None, is_due: bool | None = None
     ) -> Segmentation:
@@ -106,6 +109,7 @@ class FramePreprocessor(ReplaceableStages):
                 instances = without_empty_masks(instances)
         return Segmentation(instances, segmenter_state_of(self.segment), timer.times)
 
+    @torch.no_grad()
     def extract_features(self, frame: RGBDFrame) -> Extraction:
         """Re-estimate the depth of a frame (III-B.1), and detect its ORB features (III-A)."""
         timer = StageTimer()

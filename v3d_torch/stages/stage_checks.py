@@ -126,6 +126,8 @@ class ReplaceableStages:
             raise ConfigError(
                 f"{name} cannot be replaced, because it is used inside {_INNER_STAGES[name]}; replace that instead"
             )
+        if name in STAGES and not callable(value):
+            raise ConfigError(f"{name} was replaced by {describe_type(value)}, which cannot be called; set a stage")
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
         is_hooked = isinstance(vars(self).get(name), HookedStage)
@@ -179,9 +181,6 @@ class ReplacedStage(CheckingProxy):
         stage: User-defined stage.
         name: Name of its attribute in `V3DSLAM`.
         replaced: Original stage of that name.
-
-    Raises:
-        ConfigError: If the original stage is callable and this one is not.
     """
 
     _OWN = CheckingProxy._OWN | {"_replaced"}
@@ -189,8 +188,6 @@ class ReplacedStage(CheckingProxy):
     def __init__(self, stage: Any, name: str, replaced: Any) -> None:
         super().__init__(stage, name)
         self._replaced = replaced
-        if callable(replaced) and not callable(stage):
-            raise ConfigError(f"{name} was replaced by {describe_type(stage)}, which cannot be called; set a stage")
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the stage.

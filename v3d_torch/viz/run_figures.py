@@ -22,6 +22,7 @@ from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 from v3d_torch.viz.voting import save_voting_figure
 
 
+@torch.inference_mode()  # some figures call stages, with tensors of a run in this mode
 def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map: PointMap) -> None:
     """Draw trajectory, masks, objects, occupancy map, and votes and clouds of the most dynamic frame, if there are any.
 

@@ -1,0 +1,36 @@
+"""Checks of the arguments of the functions of tensors that cost no time: no check reads the values of a tensor."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from v3d_torch.errors import ConfigError, InputError
+
+
+def check_masks(**masks: Tensor | None) -> None:
+    """Check that masks are of type bool: an index by a mask of whole numbers would select other elements.
+
+    Args:
+        masks: Masks by the name of the argument; None for a mask that was not given.
+
+    Raises:
+        InputError: If a mask is not of type bool.
+    """
+    for name, mask in masks.items():
+        if mask is not None and mask.dtype != torch.bool:
+            raise InputError(f"{name} has the type {mask.dtype}; give a mask of type torch.bool")
+
+
+def check_positive(**numbers: Tensor | float) -> None:
+    """Check that parameters are positive.
+
+    Args:
+        numbers: Parameters by the name of the argument; those that are tensors are not checked.
+
+    Raises:
+        ConfigError: If a number is not positive, also if it is NaN.
+    """
+    for name, number in numbers.items():
+        if not isinstance(number, Tensor) and not number > 0:
+            raise ConfigError(f"{name} is {number}; give a number above 0")
