@@ -35,6 +35,9 @@ _MAX_SOCKET_PATH = 103
 _SOCKET_NAME = "/pymp-01234567/listener-01234567"
 """Form of the path of a fork server's socket in the temporary folder."""
 
+_SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+"""Environment variable of processes that import nothing from the current folder, where a file ``html.py`` can be."""
+
 _NO_LINKS: int = getattr(os, "O_NOFOLLOW", 0)
 """Flag of files that are opened without following a link; Windows has none."""
 
@@ -81,7 +84,8 @@ class ProcessExecutor:
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
         context = start_method()
         parent_end, child_end = context.Pipe()
-        with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
+        variables = _SAFE_PATH | (ONE_THREAD_ENVIRONMENT if self.workers > 1 else {})
+        with _environment(variables), _block_interrupts():
             arguments = job, child_end, dict(os.environ)
             process = context.Process(target=_process_main, args=arguments, name=str(job))
             process.start()

@@ -31,7 +31,7 @@ def _start_compiling_backwards() -> subprocess.Popen[bytes]:
     """Start a second process that compiles the kernels, starting with the last one, and stores them in the cache."""
     command = "import v3d_torch.slam; from v3d_torch.kernels.compiler import compile_kernels as c; [*c(backwards=True)]"
     return subprocess.Popen(  # noqa: S603 - runs this package
-        [sys.executable, "-c", command],
+        [sys.executable, "-P", "-c", command],  # -P: nothing of the current folder is imported
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
