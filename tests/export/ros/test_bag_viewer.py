@@ -301,6 +301,12 @@ def test_lost_camera_has_camera_info_only_and_removes_the_markers_once(tmp_path:
     assert messages["/objects"][-1][0] == round(1e8 * (FRAMES - lost))
 
 
+def test_camera_that_is_never_found_has_camera_info_only(tmp_path: Path) -> None:
+    run = Recorded(tmp_path / "run.mcap", Dark(from_frame=0))
+    assert set(run.pipeline.slam.poses.statuses) == {"lost"}
+    assert read_with_mcap(run.path).keys() == {"/camera/color/camera_info"}
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [("run.bag", "choose a name that ends in .mcap"), ("taken.mcap", "already exists"), ("file/run.mcap", "file")],
