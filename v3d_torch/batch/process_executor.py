@@ -22,6 +22,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import remove_link
+from v3d_torch.runtime.imports import import_environment
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
@@ -34,9 +35,6 @@ _MAX_SOCKET_PATH = 103
 
 _SOCKET_NAME = "/pymp-01234567/listener-01234567"
 """Form of the path of a fork server's socket in the temporary folder."""
-
-_SAFE_PATH = {"PYTHONSAFEPATH": "1"}
-"""Environment variable of processes that import nothing from the current folder, where a file ``html.py`` can be."""
 
 _NO_LINKS: int = getattr(os, "O_NOFOLLOW", 0)
 """Flag of files that are opened without following a link; Windows has none."""
@@ -84,7 +82,7 @@ class ProcessExecutor:
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
         context = start_method()
         parent_end, child_end = context.Pipe()
-        variables = _SAFE_PATH | (ONE_THREAD_ENVIRONMENT if self.workers > 1 else {})
+        variables = import_environment() | (ONE_THREAD_ENVIRONMENT if self.workers > 1 else {})
         with _environment(variables), _block_interrupts():
             arguments = job, child_end, dict(os.environ)
             process = context.Process(target=_process_main, args=arguments, name=str(job))

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from v3d_torch.kernels import compiler
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
+from v3d_torch.runtime.imports import import_environment
 
 
 def compile_kernels(console: Console) -> None:
@@ -31,8 +32,8 @@ def _start_compiling_backwards() -> subprocess.Popen[bytes]:
     """Start a second process that compiles the kernels, starting with the last one, and stores them in the cache."""
     command = "import v3d_torch.slam; from v3d_torch.kernels.compiler import compile_kernels as c; [*c(backwards=True)]"
     return subprocess.Popen(  # noqa: S603 - runs this package
-        [sys.executable, "-P", "-c", command],  # -P: nothing of the current folder is imported
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        [sys.executable, "-c", command],
+        env=os.environ | import_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
