@@ -12,6 +12,7 @@ from threading import Event
 import pytest
 from helpers.batches import plan_seeds, repeat_sequence
 
+from v3d_torch.batch import process_executor
 from v3d_torch.batch.executor import JobFinished, JobProgress, report_lost_process
 from v3d_torch.batch.process_executor import ProcessExecutor
 
@@ -71,4 +72,17 @@ def test_jobs_run_where_the_path_of_the_temporary_folder_is_long(
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
     planned = plan_seeds(moment, tmp_path / "out", seeds=1)
     *_, end = ProcessExecutor(1)(planned, Event())
+    assert isinstance(end, JobFinished) and end.failure is None
+
+
+def test_job_imports_nothing_from_the_current_folder(
+    moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new interpreter is started with ``-c``, which by default imports from there first."""
+    (tmp_path / "socket.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(process_executor, "start_method", lambda: multiprocessing.get_context("spawn"))
+    planned = plan_seeds(moment, tmp_path / "out", seeds=1)
+    *_, end = ProcessExecutor(1)(planned, Event())
+    assert not (tmp_path / "imported").exists()
     assert isinstance(end, JobFinished) and end.failure is None

@@ -122,6 +122,18 @@ def test_timestamps_in_another_unit_are_named(factor: float, unit: str) -> None:
             evaluate(groundtruth, estimate)
 
 
+@pytest.mark.parametrize("origin", [0.0, 1305031229.0])
+def test_unit_of_a_short_estimate_is_not_doubted(origin: float) -> None:
+    """Of two poses, and of four poses that the ground truth does not have; both last a thousandth of its time."""
+    groundtruth = random_walk(1000, seed=18)
+    groundtruth = Trajectory(groundtruth.stamps - groundtruth.stamps[0] + origin, groundtruth.T_wc)
+    with pytest.raises(InputError, match=r"that the estimate is complete, it is too short with 2 poses$"):
+        evaluate(groundtruth, Trajectory(groundtruth.stamps[:2], groundtruth.T_wc[:2]))
+    later = groundtruth.stamps[-1] + 1 + torch.arange(4, dtype=torch.float64) / 100
+    with pytest.raises(InputError, match=r"check that both belong to the same sequence$"):
+        evaluate(groundtruth, Trajectory(later, groundtruth.T_wc[:4]))
+
+
 @pytest.mark.parametrize(
     ("coverage", "text"),
     [(1.0, "100.0%"), (1 - 1e-6, "99.9%"), (693 / 694, "99.8%"), (0.9, "90.0%"), (0.29, "29.0%"), (0.0, "0.0%")],

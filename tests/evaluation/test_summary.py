@@ -110,6 +110,11 @@ def test_missing_sequences_keep_the_papers_order_and_scores() -> None:
     assert [row["median"] for row in missing[:8]] == ["0.009", *[""] * 5, "0.006", ""]
 
 
+def test_names_with_marks_of_tables_and_html_are_escaped_in_markdown() -> None:
+    document = format_markdown(runs("a|b & c&lt; <i>", "x|y", 0.1))
+    assert r"| sequence | x\|y |" in document and r"| a\|b & c\&lt; \<i> | 0.1000 |" in document
+
+
 def test_failures_are_listed_below() -> None:
     document = format_markdown(OUTCOMES)
     assert document.count("- fr3/w/xyz, base_line, seed 1: failed: it | broke") == 1

@@ -12,6 +12,7 @@ import pytest
 import torch
 from helpers.colmap_reader import ColmapModel, read_model, read_with_pycolmap
 from helpers.posed_images import CAMERA, COLOURS, DISTORTED, FISHEYE, POINTS, T_WC, posed_images
+from torch import Tensor
 
 from v3d_torch.export.colmap import write_colmap
 from v3d_torch.export.landmark_tracks import LandmarkTracks
@@ -28,12 +29,12 @@ SHIFT = torch.tensor([0.3, 0.4], dtype=torch.float64)
 """Error of all image points, pixels."""
 
 
-def make_tracks(camera: PinholeCamera) -> LandmarkTracks:
-    """The first three points, observed in both images."""
+def make_tracks(camera: PinholeCamera, points: Tensor = POINTS[:3]) -> LandmarkTracks:
+    """Three points, observed in both images."""
     T_cw = invert(T_WC)
-    first, second = (camera.project(POINTS[:3] @ T[:3, :3].T + T[:3, 3]) + SHIFT for T in T_cw)
+    first, second = (camera.project(points @ T[:3, :3].T + T[:3, 3]) + SHIFT for T in T_cw)
     image, landmark = torch.tensor([0, 0, 0, 1, 1, 1]), torch.tensor([0, 1, 2, 2, 1, 0])
-    return LandmarkTracks(POINTS[:3], image, landmark, torch.cat([first, second.flip(0)]))
+    return LandmarkTracks(points, image, landmark, torch.cat([first, second.flip(0)]))
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,25 @@ def test_masks_are_named_by_image_and_black_where_something_moves(
     for name in model.images:
         mask = cv2.imread(str(folder / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
         assert (mask[:, :40] == 0).all() and (mask[:, 40:] == 255).all()
+
+
+def test_landmarks_are_not_observed_on_what_moves(tmp_path: Path) -> None:
+    """The first point is masked in both images, the second in one; only the third one is left."""
+    tracks = make_tracks(CAMERA, POINTS[[4, 1, 0]])
+    first, second = posed_images()
+    u, v = tracks.uv[4].round().to(torch.int64).tolist()
+    static = second.static.clone()
+    static[v, u] = False
+    none = torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)
+    write_colmap(tmp_path, CAMERA, [first, replace(second, static=static)], none, tracks)
+    model = read_model(tmp_path / "sparse" / "0")
+    (point,) = model.points.values()
+    np.testing.assert_allclose(point["xyz"], POINTS[0], atol=1e-6)
+    assert point["color"] == COLOURS[0].tolist() and point["error"] == pytest.approx(0.5, abs=1e-3)
+    assert sorted(point["track"]) == [[name, 0] for name in sorted(model.images)]
+    for image in model.images.values():
+        ((*_, number),) = image["points"]
+        assert model.points[number] is point
 
 
 def test_large_map_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

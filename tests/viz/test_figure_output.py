@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,18 @@ def test_svg_has_colours_of_page_and_is_reproducible() -> None:
     assert "#000000" not in one and "currentColor" in one
     assert ">read</text>" in one  # text, not outlines
     assert "fill: #ffffff" not in one
+
+
+def test_figures_of_a_page_have_different_ids_and_refer_to_their_own() -> None:
+    ids = []
+    for name in ("bars", "other"):
+        svg = embed_svg(draw_stage_bars({"read": 0.1}), name)
+        own = re.findall(r'\sid="([^"]+)"', svg)
+        assert f"{name}-figure_1" in own
+        references = re.findall(r'(?:href="#|url\(#)([^")]+)', svg)
+        assert references and set(references) <= set(own)
+        ids += own
+    assert len(ids) == len(set(ids))
 
 
 def test_png_file_has_the_pixels_of_savefig(tmp_path: Path) -> None:

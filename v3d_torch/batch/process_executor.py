@@ -22,6 +22,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import remove_link
+from v3d_torch.runtime.imports import import_environment
 
 if TYPE_CHECKING:
     from multiprocessing.context import ForkServerContext, SpawnContext
@@ -81,7 +82,8 @@ class ProcessExecutor:
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
         context = start_method()
         parent_end, child_end = context.Pipe()
-        with _environment(ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}), _block_interrupts():
+        variables = import_environment() | (ONE_THREAD_ENVIRONMENT if self.workers > 1 else {})
+        with _environment(variables), _block_interrupts():
             arguments = job, child_end, dict(os.environ)
             process = context.Process(target=_process_main, args=arguments, name=str(job))
             process.start()

@@ -7,13 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
-
 from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.datasets.gravity_file import write_gravity_file
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.depth_units import SATURATED_DEPTH
+from v3d_torch.geometry.depth_units import SATURATED_DEPTH, depth_to_units
 from v3d_torch.io.files import append_line, check_empty_folder, check_writable, write_png, write_text
 from v3d_torch.types import RGBDFrame, Trajectory
 
@@ -81,12 +79,10 @@ class TUMWriter:
                 write_gravity_file(self.folder, frame.stamp, frame.gravity)
         rgb, depth = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
         listed_rgb, listed_depth = f"{rgb} rgb/{rgb}.png", f"{depth} depth/{depth}.png"
-        units = np.rint(frame.depth[0].numpy() * self._depth_scale)
-        is_out_of_range = units >= SATURATED_DEPTH
-        units[is_out_of_range] = 0
-        self._out_of_range += int(is_out_of_range.sum())
+        units, out_of_range = depth_to_units(frame.depth, self._depth_scale)
+        self._out_of_range += out_of_range
         write_png(self.folder / "rgb" / f"{rgb}.png", frame.image.permute(1, 2, 0).numpy())
-        write_png(self.folder / "depth" / f"{depth}.png", units.astype(np.uint16))
+        write_png(self.folder / "depth" / f"{depth}.png", units)
         append_line(self.folder / "rgb.txt", listed_rgb)
         append_line(self.folder / "depth.txt", listed_depth)
         append_line(self.folder / "associations.txt", f"{listed_rgb} {listed_depth}")

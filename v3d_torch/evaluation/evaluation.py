@@ -101,7 +101,7 @@ def evaluate(
         raise InputError(
             f"only {len(matches)} poses of the estimate {_time_range(estimate)} are within {max_time_difference:g} s of"
             f" the ground truth {_time_range(groundtruth)}, at least {MIN_PAIRS} are needed;"
-            f" {_suggest(_duration(groundtruth), _duration(estimate))}"
+            f" {_suggest(groundtruth, estimate)}"
         )
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
     oriented = has_orientations(groundtruth)
@@ -189,20 +189,27 @@ def _located_scale_error(T_gc: Tensor, T_ec: Tensor, is_located: Tensor | None, 
     return scale_error(T_gc, T_ec, align(T_gc, T_ec, oriented=oriented))
 
 
-def _suggest(true: float, estimated: float) -> str:
-    """Return what to do if hardly any poses are associated, from the durations of ground truth and estimate."""
-    if min(true, estimated) > 0:
-        ratio = max(true, estimated) / min(true, estimated)
+def _suggest(groundtruth: Trajectory, estimate: Trajectory) -> str:
+    """Return what to do if hardly any poses are associated."""
+    advice = "check that both belong to the same sequence"
+    if len(estimate) < MIN_PAIRS:
+        return f"{advice} and that the estimate is complete, it is too short with {len(estimate)} poses"
+    for name, counts, seconds in (
+        ("estimate", estimate.stamps, groundtruth.stamps),
+        ("ground truth", groundtruth.stamps, estimate.stamps),
+    ):
         for factor, unit in _UNITS.items():
-            if factor / _UNIT_TOLERANCE < ratio < factor * _UNIT_TOLERANCE:
-                name = "estimate" if estimated > true else "ground truth"
+            if _is_same_time(counts / factor, seconds):
                 return f"the timestamps of the {name} seem to be in {unit}, write them in seconds"
-    return "check that both belong to the same sequence"
+    return advice
 
 
-def _duration(trajectory: Trajectory) -> float:
-    """Return the time from the first to the last pose in the unit of the timestamps; 0 without poses."""
-    return float(trajectory.stamps[-1] - trajectory.stamps[0]) if len(trajectory) else 0.0
+def _is_same_time(a: Tensor, b: Tensor) -> bool:
+    """Check whether timestamps (N,) and (M,) overlap and have similar durations, of which neither is 0."""
+    if not len(a) or not len(b) or a[-1] < b[0] or b[-1] < a[0]:
+        return False
+    durations = float(a[-1] - a[0]), float(b[-1] - b[0])
+    return max(durations) < _UNIT_TOLERANCE * min(durations)
 
 
 def _time_range(trajectory: Trajectory) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -92,7 +93,7 @@ def make_screen_legend(legend: str) -> Padding:
 
 def markdown_row(cells: Sequence[str]) -> str:
     """Format a row of a Markdown table."""
-    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
+    return f"| {' | '.join(map(_escape_markdown, cells))} |"
 
 
 def format_markdown_table(table: ErrorTable, first_heading: str = "sequence", note: str = "") -> list[str]:
@@ -103,7 +104,8 @@ def format_markdown_table(table: ErrorTable, first_heading: str = "sequence", no
         first_heading: Heading of the column with the names of the rows.
         note: Text above the table.
     """
-    lines = ["", f"## {table.heading}", *([note] if note else []), "", markdown_row([first_heading, *table.methods])]
+    lines = ["", f"## {_escape_markdown(table.heading)}", *([note] if note else []), ""]
+    lines.append(markdown_row([first_heading, *table.methods]))
     lines.append(markdown_row(["---", *["---:"] * len(table.methods)]))
     for name, cells in table.rows.items():
         lines.append(markdown_row([name, *(f"**{cell.text}**" if cell.is_bold else cell.text for cell in cells)]))
@@ -173,6 +175,11 @@ def make_screen_table(table: ErrorTable, first_heading: str = "sequence", note: 
         lines = [shorten(line, _MAX_SCREEN_NAME) for line in name.replace(" (", "\n(").split("\n")]
         shown.add_row(escape("\n".join(lines)), *marked)
     return shown
+
+
+def _escape_markdown(text: str) -> str:
+    """Escape what would end a cell, or begin an element or a character of HTML: names can contain it."""
+    return re.sub(r"[|<]|&(?=#?\w+;)", r"\\\g<0>", text)
 
 
 _LATEX_ESCAPES = str.maketrans(

@@ -32,7 +32,8 @@ def write_colmap(
 ) -> None:
     """Write ``images/``, ``masks/`` and the model ``sparse/0``: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 
-    Masks have the names that COLMAP expects: the name of the image with ``.png`` appended.
+    Masks have the names that COLMAP expects: the name of the image with ``.png`` appended. Image points on masked
+    pixels, which can be people, are left out, and so are landmarks that fewer than two images observe without them.
 
     Args:
         folder: Empty folder.
@@ -48,14 +49,23 @@ def write_colmap(
     model = folder / "sparse" / "0"
     uv = camera.distort(tracks.uv)
     colours = torch.zeros(len(tracks.points), 3, dtype=torch.uint8)
-    lines, poses = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then X, Y, POINT3D_ID of each point"], []
+    is_static = torch.zeros(len(uv), dtype=torch.bool)
+    image_lines, poses = [], []
     for index, image in enumerate(images):
         image.write_colour(folder / "images")
         image.write_mask(folder / "masks" / f"{image.name}.png")
-        observed = tracks.image == index
-        colours[tracks.landmark[observed]] = _colours_at(image, uv[observed])
-        lines += [_image_line(index, image), _observation_line(uv[observed], tracks.landmark[observed])]
+        observed = torch.nonzero(tracks.image == index)[:, 0]
+        observed = observed[_values_at(image.static, uv[observed])]
+        is_static[observed] = True
+        colours[tracks.landmark[observed]] = _values_at(image.frame.image, uv[observed]).T
+        image_lines.append(_image_line(index, image))
         poses.append(invert(image.T_wc)[None])
+    tracks = tracks.select(is_static)
+    uv = camera.distort(tracks.uv)
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then X, Y, POINT3D_ID of each point"]
+    for index, line in enumerate(image_lines):
+        observed = tracks.image == index
+        lines += [line, _observation_line(uv[observed], tracks.landmark[observed])]
     write_text(model / "cameras.txt", f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS\n{_camera_line(camera)}\n")
     write_text(model / "images.txt", "\n".join(lines) + "\n")
     T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
@@ -97,11 +107,10 @@ def _observation_line(uv: Tensor, landmark: Tensor) -> str:
     )
 
 
-def _colours_at(image: PosedImage, uv: Tensor) -> Tensor:
-    """Return the colours of pixels, uint8, shape (N, 3)."""
-    colour = image.frame.image
+def _values_at(image: Tensor, uv: Tensor) -> Tensor:
+    """Return the values of an image (..., H, W) at the nearest pixels, shape (..., N)."""
     u, v = uv.round().long().unbind(dim=1)
-    return colour[:, v.clamp(0, colour.shape[1] - 1), u.clamp(0, colour.shape[2] - 1)].T
+    return image[..., v.clamp(0, image.shape[-2] - 1), u.clamp(0, image.shape[-1] - 1)]
 
 
 def _reprojection_errors(camera: PinholeCamera, tracks: LandmarkTracks, uv: Tensor, T_cw: Tensor) -> Tensor:
@@ -116,7 +125,7 @@ def _reprojection_errors(camera: PinholeCamera, tracks: LandmarkTracks, uv: Tens
 
 
 def _landmark_lines(tracks: LandmarkTracks, colours: Tensor, errors: Tensor) -> str:
-    """Return a line per landmark, with its image points."""
+    """Return a line per landmark that has image points, with them."""
     counts = torch.bincount(tracks.image)
     position = torch.arange(len(tracks.image)) - (counts.cumsum(dim=0) - counts)[tracks.image]
     observations: list[list[str]] = [[] for _ in range(len(tracks.points))]
@@ -126,6 +135,7 @@ def _landmark_lines(tracks: LandmarkTracks, colours: Tensor, errors: Tensor) -> 
     return "".join(
         f"{row} {x:.6f} {y:.6f} {z:.6f} {red} {green} {blue} {error:.4f} {' '.join(track)}\n"
         for row, ((x, y, z), (red, green, blue), error, track) in enumerate(rows, start=1)
+        if track
     )
 
 

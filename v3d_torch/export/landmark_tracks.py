@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -35,6 +35,18 @@ class LandmarkTracks:
     image: Tensor
     landmark: Tensor
     uv: Tensor
+
+    def select(self, observations: Tensor) -> LandmarkTracks:
+        """Keep some observations, except those of landmarks that fewer than two images would observe.
+
+        The points keep their rows, also those without observations.
+
+        Args:
+            observations: True for observations to keep, bool, shape :math:`(O,)`.
+        """
+        counts = torch.bincount(self.landmark[observations], minlength=len(self.points))
+        kept = observations & (counts >= _MIN_OBSERVATIONS)[self.landmark]
+        return replace(self, image=self.image[kept], landmark=self.landmark[kept], uv=self.uv[kept])
 
 
 def landmark_tracks(tables: MapTables, images: Trajectory) -> LandmarkTracks:

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
 from v3d_torch.export.posed_image import CORNER_OFFSET, PosedImage
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import SATURATED_DEPTH, depth_to_units
 from v3d_torch.io.files import atomic_write, write_png, write_text
+
+_LOG = logging.getLogger(__name__)
 
 _MILLIMETRES = 1000
 """Units of the depth images per metre: nerfstudio's default."""
@@ -26,6 +29,8 @@ _OPENGL_AXES = torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64)
 
 def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[PosedImage], points: Path) -> None:
     """Write a folder for nerfstudio: ``images/``, ``masks/``, ``depths/``, ``points.ply`` and ``transforms.json``.
+
+    Depth beyond 65.53 m, the 16-bit range of millimetres, is written as 0, no measurement, with a warning in the log.
 
     Args:
         folder: Empty folder.
@@ -38,7 +43,12 @@ def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[Posed
         OutputError: If a file cannot be written.
     """
     lens = _lens(camera)
-    frames = [_write_frame(folder, image) for image in images]
+    written = [_write_frame(folder, image) for image in images]
+    if out_of_range := sum(count for _, count in written):
+        _LOG.warning(
+            "%s: %d depth values beyond %.4g m were saved as 0; depth images for nerfstudio are 16-bit millimetres",
+            folder, out_of_range, (SATURATED_DEPTH - 1) / _MILLIMETRES,
+        )  # fmt: skip
     with atomic_write(folder / "points.ply") as temporary:
         shutil.copyfile(points, temporary)
     transforms = {
@@ -51,7 +61,7 @@ def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[Posed
         "cy": camera.cy + CORNER_OFFSET,
         "depth_unit_scale_factor": 1 / _MILLIMETRES,
         "ply_file_path": "points.ply",
-        "frames": frames,
+        "frames": [entry for entry, _ in written],
     }
     write_text(folder / "transforms.json", json.dumps(transforms, indent=1) + "\n")
 
@@ -76,15 +86,16 @@ def opengl_pose(T_wc: Tensor) -> Tensor:
     return T_wc * _OPENGL_AXES
 
 
-def _write_frame(folder: Path, image: PosedImage) -> dict[str, Any]:
-    """Write the images of a frame and return its entry."""
+def _write_frame(folder: Path, image: PosedImage) -> tuple[dict[str, Any], int]:
+    """Write the images of a frame; return its entry and the number of pixels whose depth is out of range."""
     image.write_colour(folder / "images")
-    units = (image.static_depth[0] * _MILLIMETRES).round().clamp(max=np.iinfo(np.uint16).max)
-    write_png(folder / "depths" / image.name, units.numpy().astype(np.uint16))
+    units, out_of_range = depth_to_units(image.static_depth, _MILLIMETRES)
+    write_png(folder / "depths" / image.name, units)
     image.write_mask(folder / "masks" / image.name)
-    return {
+    entry = {
         "file_path": f"images/{image.name}",
         "mask_path": f"masks/{image.name}",
         "depth_file_path": f"depths/{image.name}",
         "transform_matrix": opengl_pose(image.T_wc).tolist(),
     }
+    return entry, out_of_range

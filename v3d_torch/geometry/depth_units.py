@@ -1,4 +1,4 @@
-"""Conversion of depth images to metres, from floating point or from whole numbers with a depth scale."""
+"""Conversion of depth images to metres, from floating point or from whole numbers with a depth scale, and back."""
 
 from __future__ import annotations
 
@@ -52,6 +52,23 @@ def depth_to_metres(depth: NDArray[Any], depth_scale: float | None) -> Tensor:
     if missing.any():
         metres[missing] = 0
     return torch.from_numpy(metres).unsqueeze(0)
+
+
+def depth_to_units(depth: Tensor, depth_scale: float) -> tuple[NDArray[np.uint16], int]:
+    """Convert depth to a 16-bit image of whole numbers.
+
+    Args:
+        depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
+        depth_scale: Units per metre.
+
+    Returns:
+        Depth image, uint16, shape (H, W), and the number of pixels whose depth does not fit into 16 bits: they are 0,
+        because the largest value would be a wrong measurement.
+    """
+    units = np.rint(depth[0].numpy() * depth_scale)
+    is_out_of_range = units >= SATURATED_DEPTH
+    units[is_out_of_range] = 0
+    return units.astype(np.uint16), int(is_out_of_range.sum())
 
 
 def missing_value(depth: NDArray[np.integer[Any]]) -> int:

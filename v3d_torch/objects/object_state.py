@@ -23,7 +23,7 @@ class ObjectState:
             NaN before the first centroid.
         velocity: World frame, m/s, float64, shape :math:`(3,)`; 0 before the second centroid.
         variances: Of each axis: variance of the position, covariance of position and velocity, variance of the
-            velocity; square metres, m^2/s and m^2/s^2.
+            velocity; square metres, m^2/s and m^2/s^2. Before the first centroid, those with which motion is expected.
         acceleration_noise: Square root of the spectral density of the acceleration, m/s^1.5: the uncertainty that a
             prediction adds.
     """
@@ -41,15 +41,21 @@ class ObjectState:
 
     @property
     def sigmas(self) -> tuple[float, float]:
-        """Standard deviation of each coordinate of the position, metres, and of the velocity, m/s."""
-        return math.sqrt(self.variances[0]), math.sqrt(self.variances[2])
+        """Standard deviation of each coordinate of position, metres, and velocity, m/s; NaN without a centroid."""
+        pp, _, vv = self._known_variances
+        return math.sqrt(pp), math.sqrt(vv)
 
     @property
     def covariance(self) -> Tensor:
-        """Covariance of position and velocity, in this order, float64, shape :math:`(6, 6)`."""
-        pp, pv, vv = self.variances
+        """Covariance of position and velocity, in this order, float64, shape :math:`(6, 6)`; NaN without a centroid."""
+        pp, pv, vv = self._known_variances
         of_axis = self.position.new_tensor([[pp, pv], [pv, vv]])
         return torch.kron(of_axis, torch.eye(3, dtype=self.position.dtype))
+
+    @property
+    def _known_variances(self) -> tuple[float, float, float]:
+        """Variances; NaN without a centroid."""
+        return self.variances if self.is_known else (math.nan, math.nan, math.nan)
 
     def predict(self, stamp: float) -> ObjectState:
         """Predict the state with constant velocity and white acceleration noise.

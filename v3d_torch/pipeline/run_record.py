@@ -98,7 +98,8 @@ class ObjectTable(TensorTable):
 
     The columns are the index and timestamp of the frame, and id, COCO class, centroid and velocity (world frame, metres
     and seconds) with the standard deviation of each coordinate, upright box (centre, size, yaw), votes, Chamfer
-    distance, position of the motion state in `MotionState`, and true if the network missed the object.
+    distance, position of the motion state in `MotionState`, and true if the network missed the object. Centroid,
+    velocity, standard deviations and box are NaN until the object has a centroid.
     """
 
     def __init__(self) -> None:
@@ -123,13 +124,15 @@ class ObjectTable(TensorTable):
         if not objects:
             return
         boxes = found.boxes(up)
+        velocity = torch.stack([each.state.velocity for each in objects])
+        velocity[[not each.state.is_known for each in objects]] = torch.nan
         self.append(
             frame=torch.full((len(objects),), frame.index),
             stamp=torch.full((len(objects),), frame.stamp, dtype=torch.float64),
             id=torch.tensor([each.id for each in objects]),
             label=torch.tensor([each.label for each in objects]),
             centroid=torch.stack([each.centroid for each in objects]),
-            velocity=torch.stack([each.state.velocity for each in objects]),
+            velocity=velocity,
             sigmas=torch.tensor([each.state.sigmas for each in objects], dtype=torch.float64),
             box=torch.tensor([_box_values(boxes.get(each.id)) for each in objects], dtype=torch.float64),
             votes=torch.tensor([each.votes for each in objects]),

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from v3d_torch.kernels import compiler
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
+from v3d_torch.runtime.imports import import_environment
 
 
 def compile_kernels(console: Console) -> None:
@@ -32,7 +33,7 @@ def _start_compiling_backwards() -> subprocess.Popen[bytes]:
     command = "import v3d_torch.slam; from v3d_torch.kernels.compiler import compile_kernels as c; [*c(backwards=True)]"
     return subprocess.Popen(  # noqa: S603 - runs this package
         [sys.executable, "-c", command],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        env=os.environ | import_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

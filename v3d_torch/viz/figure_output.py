@@ -57,12 +57,13 @@ def embed_svg(figure: Figure, name: str) -> str:
 
     Args:
         figure: Figure to embed.
-        name: Name of the figure, unique within the page, from which the ids of the SVG are derived.
+        name: Name of the figure, unique within the page: its ids begin with it, or are hashes that contain it.
     """
     buffer = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
+    text = text.replace('<g id="', f'<g id="{name}-')  # the names of groups, figure_1 etc., are those of every figure
     return text[text.index("<svg") :].replace("#000000", "currentColor")
 
 

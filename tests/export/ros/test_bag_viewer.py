@@ -66,6 +66,18 @@ class Recorded:
         self.keyframes = len(self.pipeline.slam.map.keyframes)
 
 
+class Dark(Wall):
+    """Wall that is dark, without depth, from a frame on."""
+
+    def __init__(self, from_frame: int) -> None:
+        super().__init__()
+        self._dark_from = from_frame
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame = super().__getitem__(index)
+        return replace(frame, image=frame.image * 0, depth=frame.depth * 0) if index >= self._dark_from else frame
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     run = Recorded(tmp_path_factory.mktemp("bag") / "new" / "run.mcap")
@@ -250,13 +262,35 @@ def test_map_and_odom_are_level_from_the_first_frame_on_if_gravity_is_measured(t
             np.testing.assert_allclose(gravity, [0, 0, -1], atol=1e-3 if frame == "odom" else 1e-9)
 
 
-def test_lost_camera_has_camera_info_only_and_removes_the_markers_once(tmp_path: Path) -> None:
-    class Dark(Wall):
-        def __getitem__(self, index: int) -> RGBDFrame:
-            frame = super().__getitem__(index)
-            return RGBDFrame(index, frame.stamp, frame.image * 0, frame.depth * 0) if index >= 8 else frame
+@pytest.mark.parametrize("lost_at", [FRAMES, 8])
+def test_map_is_turned_at_the_end_if_up_is_known_only_then(lost_at: int, tmp_path: Path) -> None:
+    """As by the floor, which is searched once more after the last frame. A lost camera has no pose to repeat."""
+    down = torch.tensor([0.0, 3**0.5 / 2, 0.5], dtype=torch.float64)
+    pipeline = Pipeline(
+        Dark(lost_at), V3DSLAM(CAMERA, squares, CONFIG), viewer=BagViewer(tmp_path / "run.mcap", CAMERA)
+    )
+    pipeline()
+    pipeline.flush()
+    pipeline.slam.up_estimator.gravity = down
+    fused, T_mw = pipeline.fuse_points(), pipeline.slam.T_lw
+    assert T_mw is not None
+    messages = read_with_mcap(tmp_path / "run.mcap")
+    before, after = (tf for _, tf in messages["/tf"][-2:])
+    path = messages["/path"][-1][1]
+    assert stamp_of(before.transforms[0].header) < stamp_of(after.transforms[0].header) == stamp_of(path.header)
+    poses = [matrix_of(each.pose) for each in path.poses]
+    trajectory = pipeline.slam.poses.trajectory()
+    np.testing.assert_allclose(np.array(poses), camera_in_map(trajectory.T_wc, T_mw), atol=1e-9)
+    T_mo = lookup(after, "map", "odom")
+    T_ol = lookup(before, "odom", "camera_link")
+    np.testing.assert_allclose(T_mo @ T_ol, poses[len(messages["/tf"]) - 2], atol=1e-9)
+    assert ("camera_link" in {each.child_frame_id for each in after.transforms}) == (lost_at == FRAMES)
+    points, _ = points_of(messages["/cloud_map"][0][1])
+    np.testing.assert_array_equal(points, points_in_map(fused.points, T_mw))
 
-    run = Recorded(tmp_path / "run.mcap", Dark())
+
+def test_lost_camera_has_camera_info_only_and_removes_the_markers_once(tmp_path: Path) -> None:
+    run = Recorded(tmp_path / "run.mcap", Dark(from_frame=8))
     messages = read_with_mcap(run.path)
     lost = run.pipeline.slam.poses.statuses.count("lost")
     assert lost > 1
@@ -265,6 +299,12 @@ def test_lost_camera_has_camera_info_only_and_removes_the_markers_once(tmp_path:
     removed = [[marker.action for marker in array.markers] == [DELETEALL] for _, array in messages["/objects"]]
     assert removed == (FRAMES - lost) * [False] + [True]
     assert messages["/objects"][-1][0] == round(1e8 * (FRAMES - lost))
+
+
+def test_camera_that_is_never_found_has_camera_info_only(tmp_path: Path) -> None:
+    run = Recorded(tmp_path / "run.mcap", Dark(from_frame=0))
+    assert set(run.pipeline.slam.poses.statuses) == {"lost"}
+    assert read_with_mcap(run.path).keys() == {"/camera/color/camera_info"}
 
 
 @pytest.mark.parametrize(

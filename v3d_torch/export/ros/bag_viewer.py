@@ -50,7 +50,7 @@ class BagViewer:
             self._write(self._messages.of_frame(frame, objects, slam), frame.stamp)
 
     def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
-        """Write the final path and map, and close the file.
+        """Write the final path and map, if the camera was ever found, and close the file.
 
         Raises:
             OutputError: If the bag could not be written completely.

@@ -14,8 +14,8 @@
 ================================  ==========================================  =====================================
 
 While the camera is lost, only ``/camera/color/camera_info`` has messages; the first lost frame also removes the markers
-of ``/objects``. ``map`` turns against ``odom`` when the floor has shown where up is; a measured gravity is known at the
-first frame.
+of ``/objects``. ``map`` turns against ``odom`` when the floor has shown where up is, at the latest at the end, with one
+more ``/tf``; a measured gravity is known at the first frame.
 """
 
 from __future__ import annotations
@@ -47,6 +47,9 @@ class Message(Protocol):
 
     __msgtype__: ClassVar[str]
 
+
+_TURN_DELAY = 1e-6
+"""Time from the last frame to the transforms of the final map, seconds: tf2 ignores those of a repeated time."""
 
 TopicMessage = tuple[str, Message]
 """Topic and message."""
@@ -95,17 +98,26 @@ class RunMessages:
             yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)
 
     def of_end(self, slam: V3DSLAM, point_map: PointMap) -> Iterator[TopicMessage]:
-        """Yield the messages of the final state, with the timestamp of the last frame.
+        """Yield the messages of the final state, with the timestamp of the last frame; none if all frames were lost.
+
+        If up has become known or more accurate since that frame, ``map`` is turned a microsecond later.
 
         Args:
             slam: System after at least one frame.
             point_map: Map of the static scene.
         """
-        stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), self._T_mw
+        if self._previous is None:
+            return
+        stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), frames.map_frame(slam.T_lw)
+        if not torch.equal(T_mw, self._T_mw):
+            stamp, self._T_mw = stamp + _TURN_DELAY, T_mw
+            T_ml = frames.camera_in_map(invert(slam.poses.poses_of([self._previous])[0]), T_mw)
+            self._odometry_frame.update(T_ml, T_ml)
+            yield "/tf", self._tree(stamp, is_lost=slam.poses.status is TrackingStatus.LOST)
         yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw))
         points = frames.points_in_map(point_map.points, T_mw)
         yield "/cloud_map", point_cloud(stamp, frames.MAP, points, point_map.colours)
-        yield from self.of_grid(slam)
+        yield from self._grid(stamp, slam)
 
     def of_grid(self, slam: V3DSLAM) -> Iterator[TopicMessage]:
         """Yield the occupancy grid, if there is one; finding its floor takes up to a tenth of a second.
@@ -113,8 +125,11 @@ class RunMessages:
         Args:
             slam: System after at least one frame.
         """
+        yield from self._grid(slam.poses.stamp, slam)
+
+    def _grid(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
         if slam.occupancy is not None and (grid := slam.occupancy.grid()) is not None:
-            yield "/map", occupancy_grid(slam.poses.stamp, frames.MAP, grid, self._T_mw)
+            yield "/map", occupancy_grid(stamp, frames.MAP, grid, self._T_mw)
 
     def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
         odometry_frame, state = self._odometry_frame, slam.states.at(stamp)
@@ -122,12 +137,7 @@ class RunMessages:
         previous = newest if self._previous is None else self._previous
         odometry_frame.update(*frames.camera_in_map(invert(slam.poses.poses_of([previous, newest])), self._T_mw))
         self._previous = newest
-        tree = {
-            (frames.MAP, frames.ODOM): odometry_frame.T_mo,
-            (frames.ODOM, frames.CAMERA): odometry_frame.T_ol,
-            (frames.CAMERA, frames.OPTICAL): frames.T_LINK_OPTICAL,  # in every frame, because a replay can start later
-        }
-        yield "/tf", transforms(stamp, tree)
+        yield "/tf", self._tree(stamp)
         to_link = _rotate_both_halves(frames.T_LINK_OPTICAL)
         to_odom = _rotate_both_halves(odometry_frame.T_ol @ frames.T_LINK_OPTICAL)
         yield (
@@ -141,6 +151,14 @@ class RunMessages:
                 twist_covariance=to_link @ state.twist_covariance @ to_link.T,
             ),
         )
+
+    def _tree(self, stamp: float, *, is_lost: bool = False) -> Message:
+        """Make the transforms of the newest pose; those of the camera are left out while it is lost."""
+        tree = {(frames.MAP, frames.ODOM): self._odometry_frame.T_mo}
+        if not is_lost:
+            tree[frames.ODOM, frames.CAMERA] = self._odometry_frame.T_ol
+            tree[frames.CAMERA, frames.OPTICAL] = frames.T_LINK_OPTICAL  # every time: a replay can start later
+        return transforms(stamp, tree)
 
     def _cloud(self, frame: RGBDFrame, static: Tensor) -> Message:
         step = slice(None, None, _CLOUD_STRIDE)

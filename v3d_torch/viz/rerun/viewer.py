@@ -16,6 +16,7 @@ from v3d_torch.errors import OutputError
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_units import depth_to_units
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
 from v3d_torch.objects.frame_objects import FrameObjects
@@ -146,8 +147,8 @@ class RerunViewer:
         bgr = np.ascontiguousarray(frame.image.permute(1, 2, 0).numpy()[..., ::-1])
         jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
         self._stream.log("world/camera/image/rgb", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
-        units = (frame.depth[0] * _DEPTH_UNITS_PER_METRE).round().clamp(max=np.iinfo(np.uint16).max)
-        png = cv2.imencode(".png", units.numpy().astype(np.uint16))[1].tobytes()
+        units, _ = depth_to_units(frame.depth, _DEPTH_UNITS_PER_METRE)
+        png = cv2.imencode(".png", units)[1].tobytes()
         grey = rr.components.Colormap.Grayscale  # distinct from the colours of the motion states in the 3D view
         image = rr.EncodedDepthImage(blob=png, media_type="image/png", meter=_DEPTH_UNITS_PER_METRE, colormap=grey)
         self._stream.log("world/camera/image/depth", image)
