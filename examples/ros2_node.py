@@ -16,6 +16,7 @@ from threading import Thread
 
 import message_filters
 import rclpy
+import torch
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.wait_for_message import wait_for_message
@@ -44,8 +45,7 @@ class SlamNode(Node):
         self.camera = v3d.PinholeCamera(*pinhole, depth_scale=1000, distortion_model=info.distortion_model)  # REP 118
         self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
-        self._messages = RunMessages(self.camera)
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
+        self._messages, self._store = RunMessages(self.camera), get_typestore(Stores.ROS2_HUMBLE)
         self._count, self._topics = 0, {}
         qos = {"qos_profile": qos_profile_sensor_data}
         subscribers = [message_filters.Subscriber(self, Image, topic, **qos) for topic in (COLOUR, DEPTH)]
@@ -72,9 +72,8 @@ class SlamNode(Node):
         times = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
         stamp = times[0] + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
         try:
-            rgb, measured = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
-            images = rgb, measured, self.camera
-            frame = v3d.RGBDFrame.from_arrays(self._count, stamp, *images, depth_delay=times[1] - times[0])
+            images = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
+            frame = v3d.RGBDFrame.from_arrays(self._count, stamp, *images, self.camera, depth_delay=times[1] - times[0])
         except v3d.InputError as error:
             self.get_logger().warning(f"a frame is skipped: {error}")
         else:
@@ -90,6 +89,7 @@ class SlamNode(Node):
 def main() -> None:
     """Run until ROS is shut down."""
     rclpy.init()
+    torch.set_num_threads(1)  # more threads mostly wait for each other
     node = SlamNode()
     Thread(target=node.receive, daemon=True).start()
     v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)

@@ -485,7 +485,8 @@ class Config(Section):
     seed: int = Field(0, ge=0, lt=1 << 63)
     """Seed of all random numbers."""
     threads: int = Field(1, gt=0, le=256)
-    """Threads of torch and OpenCV: the tensors of a frame are small, and more threads mostly wait for each other."""
+    """Threads of torch and OpenCV: the tensors of a frame are small, and more threads mostly wait for each other. The
+    commands set them; in Python, call `torch.set_num_threads`."""
     prefetch: bool = True
     """True to preprocess the next frames in threads while one is tracked, and to run the back end in a thread. The
     results are the same."""

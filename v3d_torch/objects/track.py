@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
 from functools import cached_property
 
@@ -188,17 +188,17 @@ class Track:
         """
         return self._predict(self._filter.visible_state, stamp)
 
-    def predict_cloud(self, stamp: float) -> Tensor:
-        """Predict the cloud: the newest cloud, moved like the position in `predict_state`.
+    def predict_motion(self, stamp: float) -> Tensor:
+        """Predict how far the newest cloud moves: like the position in `predict_state`.
 
         Args:
             stamp: Timestamp, seconds.
 
         Returns:
-            Point cloud, world frame, metres, float64, shape :math:`(P, 3)`.
+            Translation, world frame, metres, float64, shape :math:`(3,)`; 0 before the first centroid.
         """
         motion = self.predict_state(stamp).position - self.predict_state(self.newest.stamp).position
-        return self.newest.cloud.to(torch.float64) + motion.nan_to_num(0.0)  # NaN before the first centroid
+        return motion.nan_to_num(0.0)
 
     def predict_return(self, stamp: float) -> ObjectState:
         """Predict the state of an object that is not observed any more, see `ObjectState.predict_with_decay`.
@@ -345,8 +345,8 @@ class Track:
             self.history = [each for each in self.history if each.stamp >= oldest] + [state]
 
 
-def predict_clouds(tracks: Iterable[Track], stamp: float, T_cw: Tensor) -> list[Tensor]:
-    """Predict the clouds of tracks in the frame of a camera, see `Track.predict_cloud`.
+def predict_clouds(tracks: Sequence[Track], stamp: float, T_cw: Tensor) -> list[Tensor]:
+    """Predict the clouds of tracks in the frame of a camera, see `Track.predict_motion`.
 
     Args:
         tracks: Tracks.
@@ -356,4 +356,10 @@ def predict_clouds(tracks: Iterable[Track], stamp: float, T_cw: Tensor) -> list[
     Returns:
         Point clouds, camera frame, metres, float64, each of shape :math:`(P, 3)`.
     """
-    return [track.predict_cloud(stamp) @ T_cw[:3, :3].T + T_cw[:3, 3] for track in tracks]
+    if not tracks:
+        return []
+    clouds = [track.newest.cloud for track in tracks]
+    counts = [len(cloud) for cloud in clouds]
+    motions = torch.stack([track.predict_motion(stamp) for track in tracks])
+    points = torch.cat(clouds).to(torch.float64) + motions.repeat_interleave(torch.tensor(counts), dim=0)
+    return list((points @ T_cw[:3, :3].T + T_cw[:3, 3]).split(counts))
