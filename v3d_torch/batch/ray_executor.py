@@ -22,6 +22,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.progress_board import ProgressBoard
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.errors import InputError
+from v3d_torch.io.text import first_line
 from v3d_torch.runs.interrupts import interrupts_between_frames
 
 _POLL_INTERVAL = 0.2
@@ -59,7 +60,7 @@ class RayExecutor:
             ray.init(address, log_to_driver=False, logging_level=logging.ERROR)
         except (OSError, RuntimeError, ValueError) as error:
             raise InputError(
-                f"--ray {address}: no Ray cluster found ({_first_line(error)}); start one with ray start --head, or"
+                f"--ray {address}: no Ray cluster found ({_describe(error)}); start one with ray start --head, or"
                 " use --ray local"
             ) from error
         self._ray = ray
@@ -107,7 +108,7 @@ class RayExecutor:
                     except ray.exceptions.TaskCancelledError:  # before it started
                         continue
                     except ray.exceptions.RayError as error:
-                        reason = f"its process or machine failed ({_first_line(error)})"
+                        reason = f"its process or machine failed ({_describe(error)})"
                         if index in repeated or stop.is_set():
                             yield report_lost_process(job, reason)
                         else:
@@ -116,8 +117,7 @@ class RayExecutor:
                             yield JobRepeated(job, reason)
         except ray.exceptions.RayError as error:
             raise InputError(
-                f"connection to the Ray cluster lost ({_first_line(error)}); repeat the command with --resume to"
-                " continue"
+                f"connection to the Ray cluster lost ({_describe(error)}); repeat the command with --resume to continue"
             ) from error
         finally:
             ray.shutdown()
@@ -130,10 +130,9 @@ def _check_connection(address: str) -> None:
         socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT).close()
 
 
-def _first_line(error: Exception) -> str:
-    """Return the first line of an error of Ray, whose message can fill pages."""
-    message = str(getattr(error, "cause", None) or error).strip()
-    return message.splitlines()[0] if message else type(error).__name__
+def _describe(error: Exception) -> str:
+    """Return the first line of an error of Ray, or of its cause in the task."""
+    return first_line(getattr(error, "cause", None) or error)
 
 
 def _task(job: Job, index: int, board: Any) -> str | None:

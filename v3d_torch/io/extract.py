@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from v3d_torch.errors import InputError, OutputError
+from v3d_torch.io.text import first_line
 
 MAX_BYTES = 20 * 2**30
 """Largest total size of the files in an archive, bytes: three times the largest TUM sequence."""
@@ -67,7 +68,7 @@ def extract_tar(archive: Path, folder: Path, *, max_bytes: int = MAX_BYTES) -> N
             raise OutputError(
                 f"{folder}: cannot be extracted ({error.strerror}); choose another --data-root"
             ) from error
-        cause = (str(error).splitlines() or [type(error).__name__])[0].removesuffix(":")
+        cause = first_line(error).removesuffix(":")
         raise InputError(f"{archive}: is not a complete tar archive ({cause}); download it again") from error
     finally:
         if scratch is not None:

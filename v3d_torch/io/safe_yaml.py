@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from v3d_torch.io.text import replace_odd_spaces
+from v3d_torch.io.text import first_line, replace_odd_spaces
 
 _MAX_LENGTH = 100_000
 """Maximum length of a YAML text, characters: longer than any valid file, and short enough for a slow parser."""
@@ -58,7 +58,7 @@ def parse_yaml(text: str) -> Any:
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
     except Exception as error:  # PyYAML converts dates, Booleans and numbers without checks: any error can result
-        raise ValueError(str(error).splitlines()[0] if str(error) else type(error).__name__) from error
+        raise ValueError(first_line(error)) from error
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -43,6 +43,12 @@ def shorten(text: str, length: int) -> str:
     return text if len(text) <= length else f"{text[: length // 2]}…{text[-(length // 2) :]}"
 
 
+def first_line(error: BaseException) -> str:
+    """Return the first line of the message of an error, which can fill pages; the type if there is no message."""
+    message = str(error).strip()
+    return message.splitlines()[0] if message else type(error).__name__
+
+
 def read_text(path: Path, expected: str) -> str:
     r"""Read a UTF-8 text file.
 

@@ -21,6 +21,7 @@ from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError, StageError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
+from v3d_torch.io.text import first_line
 from v3d_torch.live.live_slam import LiveSLAM
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
@@ -131,7 +132,7 @@ class Pipeline:
             record.failure = str(error)
         except Exception as error:  # keep the results so far after an error of the program
             _LOG.exception("the run failed")
-            reason = (str(error).splitlines() or [""])[0]
+            reason = first_line(error)
             record.failure = f"the program failed with {type(error).__name__}: {reason}; report it with the run.log"
         except KeyboardInterrupt:
             record.interrupted = True

@@ -14,7 +14,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import Evaluation, evaluate
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text import first_line, read_text
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import Metrics, read_metrics, suggest_folder
 from v3d_torch.types import Trajectory
@@ -116,8 +116,7 @@ def _read_table(path: Path, columns: tuple[str, ...]) -> pa.Table | None:
         table = pq.read_table(path)
         missing = set(columns) - set(table.column_names)  # decodes the names, which can fail
     except (pa.ArrowException, OSError, ValueError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path}: is not a parquet table ({reason}); run the sequence again") from error
+        raise InputError(f"{path}: is not a parquet table ({first_line(error)}); run the sequence again") from error
     if missing:
         raise InputError(
             f"{path}: has no columns {', '.join(sorted(missing))}; the file is from another version, run the sequence"

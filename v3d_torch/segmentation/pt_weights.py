@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.errors import WeightsError
+from v3d_torch.io.text import first_line
 from v3d_torch.segmentation.weights import sha256_of
 
 _MODULE_CLASSES = {
@@ -69,9 +70,8 @@ def read_pt_weights(path: Path, sha256: str) -> dict[str, Tensor]:
             content = torch.load(path, map_location="cpu", weights_only=True)
         return dict(_named_tensors(content["model"]))
     except (pickle.UnpicklingError, RuntimeError, EOFError, AttributeError, KeyError, TypeError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise WeightsError(
-            f"{path}: cannot be read safely as network weights ({reason}); use the published file"
+            f"{path}: cannot be read safely as network weights ({first_line(error)}); use the published file"
         ) from error
 
 

@@ -62,7 +62,12 @@ def test_camera_without_accelerometer_has_no_accelerations() -> None:
     assert measure_accelerations("simulated", rs.software_device(), None).shape == (0, 3)
 
 
-def test_accelerometer_that_cannot_be_read_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("message", "reason"), [("Device or resource busy\nmore", "Device or resource busy"), ("", "RuntimeError")]
+)
+def test_accelerometer_that_cannot_be_read_is_logged(
+    caplog: pytest.LogCaptureFixture, message: str, reason: str
+) -> None:
     _, _, profile, colour = make_device()
 
     class Busy:
@@ -70,7 +75,7 @@ def test_accelerometer_that_cannot_be_read_is_logged(caplog: pytest.LogCaptureFi
             return [profile]
 
         def open(self, profile: Any) -> None:
-            raise RuntimeError("Device or resource busy\nmore")
+            raise RuntimeError(message)
 
     identity = rs.extrinsics()
     identity.rotation, identity.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0]
@@ -78,4 +83,4 @@ def test_accelerometer_that_cannot_be_read_is_logged(caplog: pytest.LogCaptureFi
     with caplog.at_level(logging.WARNING):
         found = measure_accelerations("simulated", SimpleNamespace(query_sensors=lambda: [Busy()]), colour)
     assert found.shape == (0, 3)
-    assert "cannot be read (Device or resource busy); gravity is not used" in caplog.text
+    assert f"cannot be read ({reason}); gravity is not used" in caplog.text

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from v3d_torch.cli import record, run
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.datasets.realsense import RealSenseCamera, RealSenseStream
+from v3d_torch.datasets.realsense.device import PipelineDevice
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.live import LiveSLAM
@@ -240,6 +242,29 @@ def test_silent_camera_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(InputError, match="simulated: sends no images; plug"):
         next(iter(RealSenseStream("simulated", lambda: camera)))
     assert camera.stopped.is_set()
+
+
+def test_error_without_a_message_is_an_interruption(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    first, second = SimulatedDevice(), SimulatedDevice()
+    frames = iter(RealSenseCamera("simulated", lambda: second if first.stopped.is_set() else first))
+    next(frames)
+    monkeypatch.setattr(first, "wait", Mock(side_effect=RuntimeError))
+    next(frames)
+    frames.close()  # type: ignore[attr-defined]
+    assert "simulated: the camera is interrupted, waiting for it (RuntimeError)" in caplog.text
+
+
+def test_device_that_fails_without_a_message_is_an_input_error() -> None:
+    config, pipeline = Mock(resolve=Mock(side_effect=RuntimeError)), rs.pipeline()
+    with pytest.raises(InputError, match=r"^simulated: no camera is connected \(RuntimeError\)$"):
+        PipelineDevice("simulated", pipeline, config, "no camera is connected")
+    config = MagicMock(**{"resolve.return_value.get_device.return_value.is_playback.return_value": False})
+    device = PipelineDevice("simulated", pipeline, config, "no camera is connected")
+    device._pipeline = Mock(start=Mock(side_effect=RuntimeError))
+    with pytest.raises(InputError, match=r"^simulated: cannot be started \(RuntimeError\); close other programs"):
+        device.start()
 
 
 def test_camera_of_another_size_is_an_input_error() -> None:

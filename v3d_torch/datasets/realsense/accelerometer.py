@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3d_torch.datasets.realsense.camera import import_librealsense
+from v3d_torch.io.text import first_line
 
 _LOG = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ def measure_accelerations(source: str, device: Any, colour: Any) -> NDArray[np.f
                     rotation = np.reshape(profile.get_extrinsics_to(colour).rotation, (3, 3), order="F")
                     return _read(rs, sensor, profile) @ rotation.T
                 except RuntimeError as error:
-                    reason = str(error).splitlines()[0]
+                    reason = first_line(error)
                     _LOG.warning("%s: the accelerometer cannot be read (%s); gravity is not used", source, reason)
                     return np.zeros((0, 3))
     return np.zeros((0, 3))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from v3d_torch.datasets.realsense.accelerometer import measure_accelerations
 from v3d_torch.datasets.realsense.camera import import_librealsense
 from v3d_torch.errors import InputError
+from v3d_torch.io.text import first_line
 
 _SIZE = (640, 480)
 """Width and height of the images of a live camera, pixels: the resolution for which the defaults are tuned."""
@@ -74,7 +75,7 @@ class PipelineDevice:
         try:
             profile = config.resolve(rs.pipeline_wrapper(pipeline))
         except RuntimeError as error:
-            raise InputError(f"{source}: {failure} ({str(error).splitlines()[0]})") from error
+            raise InputError(f"{source}: {failure} ({first_line(error)})") from error
         device = profile.get_device()
         colour = profile.get_stream(rs.stream.color)
         self.intrinsics = colour.as_video_stream_profile().intrinsics
@@ -103,8 +104,7 @@ class PipelineDevice:
                 self._pipeline.start(self._config)
             except RuntimeError as error:
                 raise InputError(
-                    f"{self._source}: cannot be started ({str(error).splitlines()[0]}); close other programs that use"
-                    " the camera"
+                    f"{self._source}: cannot be started ({first_line(error)}); close other programs that use the camera"
                 ) from error
             return
         self._playback.set_real_time(False)  # play as fast as the frames are consumed

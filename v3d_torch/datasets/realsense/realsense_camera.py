@@ -17,6 +17,7 @@ from v3d_torch.datasets.realsense.camera import import_librealsense
 from v3d_torch.datasets.realsense.device import Device, open_live_device
 from v3d_torch.datasets.realsense.realsense_stream import CapturedImages, RealSenseStream
 from v3d_torch.errors import InputError
+from v3d_torch.io.text import first_line
 from v3d_torch.types import RGBDFrame
 
 _LOG = logging.getLogger(__name__)
@@ -97,7 +98,7 @@ class RealSenseCamera(RealSenseStream):
         except (InputError, RuntimeError) as error:
             if is_first:
                 raise
-            _LOG.warning("%s: the camera is interrupted, waiting for it (%s)", self.name, str(error).splitlines()[0])
+            _LOG.warning("%s: the camera is interrupted, waiting for it (%s)", self.name, first_line(error))
             return None
 
     def _reopen(self, serial: str) -> Device | None:

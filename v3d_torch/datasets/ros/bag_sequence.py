@@ -24,6 +24,7 @@ from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.download import Progress
+from v3d_torch.io.text import first_line
 from v3d_torch.io.timestamps import associate
 
 if TYPE_CHECKING:
@@ -171,9 +172,10 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
 
 def _damaged_bag_error(path: Path, error: Exception) -> InputError:
     # rosbags does not wrap the errors of the libraries that it uses for each format.
-    cause = str(error).splitlines()[0] if str(error) else type(error).__name__
     repair = _REPAIR_COMMANDS[path.suffix] if path.is_file() else "ros2 bag reindex"
-    return InputError(f"{path}: is damaged or not a bag ({cause}); copy it again, or repair it with {repair}")
+    return InputError(
+        f"{path}: is damaged or not a bag ({first_line(error)}); copy it again, or repair it with {repair}"
+    )
 
 
 def _read_messages(path: Path, *topics: str) -> Iterator[tuple[str, int, Any]]:
