@@ -20,7 +20,7 @@ from v3d_torch.batch import ablation_study
 from v3d_torch.cli.ablate import app
 from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets.tum import TUMSequence
-from v3d_torch.errors import OutputError
+from v3d_torch.errors import InputError, OutputError
 from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
@@ -238,11 +238,22 @@ class FakeRun:
         (self._folder / "metrics.json").write_text(json.dumps({"ate": {"rmse": 0.01, "std": 0.002}, "rpe": None}))
 
 
-def test_program_error_fails_only_its_run(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ablation_study, "Run", FakeRuns(RuntimeError("shapes differ"), at=1))
+@pytest.mark.parametrize(
+    ("error", "failure"),
+    [
+        (RuntimeError("shapes\ndiffer"), "RuntimeError: shapes differ"),
+        (RuntimeError(), "RuntimeError"),
+        (InputError("x: is damaged; copy it again"), "x: is damaged; copy it again"),
+    ],
+    ids=["two lines", "no message", "of the input"],
+)
+def test_error_fails_only_its_run(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, failure: str
+) -> None:
+    monkeypatch.setattr(ablation_study, "Run", FakeRuns(error, at=1))
     result = call("--seq", sequence, "--variants", "baseline", "--out", tmp_path)
-    assert_error_line(result, "1 of 3 runs failed", "RuntimeError: shapes differ")
-    assert [row["failure"] for row in rows_of(tmp_path)] == ["", "RuntimeError: shapes differ", ""]
+    assert_error_line(result, "1 of 3 runs failed", failure)
+    assert [row["failure"] for row in rows_of(tmp_path)] == ["", failure, ""]
 
 
 def test_full_disk_ends_the_study(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -27,6 +27,16 @@ class AtStart:
         raise RuntimeError("no\\nlicence")
 
 
+class WithoutMessage:
+    def __init__(self, config, camera):
+        assert camera is None
+
+
+class OfTheInput:
+    def __init__(self, config, camera):
+        raise InputError("x.onnx: is missing; download it")
+
+
 class WhenCalled:
     def __init__(self, config, camera):
         pass
@@ -76,6 +86,8 @@ def test_class_gets_configuration_and_camera(own: Path) -> None:
         (f"{MODULE}:number", "is a int, which cannot be called; name a class, or a function that returns the stage"),
         (f"{MODULE}:one_argument", "does not accept two arguments, config and camera (too many positional arguments)"),
         ("raising_stages:AtStart", "cannot be made (RuntimeError: no licence); correct it"),
+        ("raising_stages:WithoutMessage", "cannot be made (AssertionError); correct it"),
+        ("raising_stages:OfTheInput", "cannot be made (x.onnx: is missing; download it); correct it"),
         (f"{MODULE}:nothing", "returned a NoneType, which cannot be called; return the stage"),
     ],
 )

@@ -29,6 +29,7 @@ from v3d_torch.evaluation.ablation import (
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import folder_name
+from v3d_torch.io.text import describe_error
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.open_sequences import open_sequences
@@ -181,7 +182,7 @@ def _run(
     except OutputError:
         raise
     except Exception as error:  # continue the study after an error in one variant; its log has the traceback
-        return {}, f"{type(error).__name__}: {error}"
+        return {}, describe_error(error)
     if pipeline.record.interrupted:
         raise KeyboardInterrupt
     if pipeline.record.failure is not None:

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.datasets import load_sequence
-from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError, V3DError
+from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.io.text import describe_error
 from v3d_torch.pipeline import FrameCallback
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
 from v3d_torch.runs.file_names import RunFile
@@ -79,9 +80,3 @@ def _matching_checkpoint(job: Job) -> Checkpoint | None:
         wanted, config=single_threaded(wanted.config)
     )
     return checkpoint if same else None
-
-
-def describe_error(error: Exception) -> str:
-    """Return the message of an error on one line, with the type of the error unless it is a `V3DError`."""
-    message = " ".join(str(error).split())
-    return message if isinstance(error, V3DError) else f"{type(error).__name__}: {message}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from v3d_torch.errors import InputError
+from v3d_torch.errors import InputError, V3DError
 
 _MAX_LENGTH = 100_000_000
 """Maximum length of a text that is read, characters: more than an hour of poses at 200 Hz; it ends endless devices."""
@@ -47,6 +47,14 @@ def first_line(error: BaseException) -> str:
     """Return the first line of the message of an error, which can fill pages; the type if there is no message."""
     message = str(error).strip()
     return message.splitlines()[0] if message else type(error).__name__
+
+
+def describe_error(error: BaseException) -> str:
+    """Return the message of an error on one line, with the type of the error unless it is a `V3DError`."""
+    message = " ".join(str(error).split())
+    if isinstance(error, V3DError):
+        return message
+    return f"{type(error).__name__}: {message}" if message else type(error).__name__
 
 
 def read_text(path: Path, expected: str) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 from v3d_torch.config import Config, StagesConfig
 from v3d_torch.errors import ConfigError, StageError, V3DError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.text import describe_error
 from v3d_torch.runtime.input_checks import describe_type
 from v3d_torch.runtime.stage_proxy import StageProxy
 
@@ -38,7 +39,7 @@ def import_stage(name: str, path: str) -> Callable[..., Any]:
         module = importlib.import_module(module_name)
     except Exception as error:  # an import runs any code
         raise ConfigError(
-            f"{key}: the module {module_name} cannot be imported ({_describe(error)}); correct it, install it, or"
+            f"{key}: the module {module_name} cannot be imported ({describe_error(error)}); correct it, install it, or"
             " add its folder to PYTHONPATH"
         ) from error
     try:
@@ -79,7 +80,7 @@ def make_stage(name: str, path: str, config: Config, camera: PinholeCamera) -> A
     try:
         stage = make(config, camera)
     except Exception as error:  # a constructor runs any code
-        raise ConfigError(f"{key}: cannot be made ({_describe(error)}); correct it") from error
+        raise ConfigError(f"{key}: cannot be made ({describe_error(error)}); correct it") from error
     if not callable(stage):
         raise ConfigError(f"{key}: returned {describe_type(stage)}, which cannot be called; return the stage")
     return ImportedStage(stage, key)
@@ -103,7 +104,7 @@ class ImportedStage(StageProxy):
         except V3DError:
             raise
         except Exception as error:  # a stage runs any code
-            raise StageError(f"{self._name} failed with {_describe(error)}") from error
+            raise StageError(f"{self._name} failed with {describe_error(error)}") from error
 
     def __getattr__(self, name: str) -> Any:
         value = super().__getattr__(name)
@@ -117,8 +118,3 @@ def first_not_given(stored: StagesConfig, given: StagesConfig) -> str | None:
         Its key and import path, such as ``stages.segment=my_package:MySegmenter``; None if there is none.
     """
     return next((f"stages.{name}={path}" for name, path in stored.paths.items() if given.paths.get(name) != path), None)
-
-
-def _describe(error: Exception) -> str:
-    """Return type and message of an error, on one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
