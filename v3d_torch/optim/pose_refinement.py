@@ -25,6 +25,7 @@ from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, POSE_TOLERANCE
 from v3d_torch.optim.reprojection import (
     INVERSE_DEPTH_SIGMA,
     MIN_DEPTH,
+    WhitenedMeasurements,
     chi_square,
     perspective,
     perspective_jacobian,
@@ -78,7 +79,7 @@ class _Problem(NamedTuple):
     def residuals_at(self, T_cw: Tensor) -> _Residuals:
         in_camera = T_cw[..., :3, :3] @ self.points.mT + T_cw[..., :3, 3:]
         projected = perspective(in_camera)
-        whitened = torch.addcmul(self.offset, self.scale, projected)
+        whitened = WhitenedMeasurements(self.scale, self.offset).residuals(projected)
         return _Residuals(T_cw, in_camera, projected, whitened, (whitened * whitened).sum(dim=-2))
 
     def chi2(self, at: _Residuals) -> Tensor:
