@@ -177,5 +177,5 @@ def test_points_that_cannot_be_numbered_are_rejected() -> None:
         with pytest.raises(InputError, match="not finite or lie too far apart"):
             voxel_pool(torch.tensor([[[0.0, 0.0, 0.0], [bad, bad, bad]]]), valid, 0.02)
     for size in (0.0, torch.nan):
-        with pytest.raises(ConfigError, match="positive"):
+        with pytest.raises(ConfigError, match=rf"^size is {size}; give a number above 0$"):
             voxel_pool(torch.zeros(1, 2, 3), valid, size)

@@ -9,8 +9,8 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
@@ -78,8 +78,7 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
     KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
-    if not size > 0:  # also if it is NaN
-        raise ConfigError(f"the voxel size is {size} m; give a positive number")
+    check_positive(size=size)
     voxel_index, occupied = _number_voxels(points.detach().to(working_dtype(points.dtype)), valid, size)
     batch, count = valid.shape
     voxels = count if not can_read(occupied) else int(occupied.max()) if batch else 0
