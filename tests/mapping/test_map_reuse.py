@@ -86,6 +86,8 @@ def test_second_run_extends_the_map(wall: tuple[Path, Pipeline], tmp_path: Path)
     assert [keyframe.is_from_earlier_run for keyframe in keyframes] == before * [True] + (len(keyframes) - before) * [
         False
     ]
+    assert second.slam.map.own_keyframes == [each for each in keyframes[before:] if not each.is_culled]
+    assert made.slam.map.own_keyframes == made.slam.map.active_keyframes
     assert [view.keyframe for view in second.views] == keyframes
     # A third run is localised in the part that the second run added.
     save_map(tmp_path / "grown.map", second.slam.mapper.map, second.views)

@@ -79,6 +79,11 @@ class MapTables:
         return [keyframe for keyframe in self.keyframes if not keyframe.is_culled]
 
     @property
+    def own_keyframes(self) -> list[Keyframe]:
+        """Active keyframes of this run, without those of an earlier run."""
+        return [keyframe for keyframe in self.active_keyframes if not keyframe.is_from_earlier_run]
+
+    @property
     def T_cw(self) -> Tensor:
         """World-to-camera poses of all keyframes, also culled ones, float64, shape :math:`(K, 4, 4)`; K can be 0."""
         return stack_poses(self.keyframes)

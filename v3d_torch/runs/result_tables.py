@@ -93,7 +93,7 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
     """Collect poses and tables of all frames so far, between two frames."""
     slam, groundtruth = pipeline.slam, pipeline.sequence.groundtruth
     trajectory = slam.poses.trajectory()
-    keyframes = [keyframe for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
+    keyframes = slam.map.own_keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     evaluation = None
     if groundtruth is not None and slam.poses.is_localised:
@@ -115,7 +115,7 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
 def _frame_table(pipeline: Pipeline) -> pa.Table:
     """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
     slam, times = pipeline.slam, pipeline.record.times
-    own = [keyframe.stamp for keyframe in slam.map.active_keyframes if not keyframe.is_from_earlier_run]
+    own = [keyframe.stamp for keyframe in slam.map.own_keyframes]
     statuses = slam.poses.statuses[: len(times)]  # one more if a frame was interrupted
     wall, cpu = times.wall.T.numpy(), times.cpu.T.numpy()
     columns = {

@@ -125,7 +125,7 @@ def _metrics(pipeline: Pipeline, evaluation: Evaluation | None) -> dict[str, obj
         "skipped": len(run.broken),
         **counts,
         "status": statuses,
-        "keyframes": sum(not keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
+        "keyframes": len(slam.map.own_keyframes),
         "known_keyframes": sum(keyframe.is_from_earlier_run for keyframe in slam.map.active_keyframes),
         "landmarks": int(slam.map.landmarks["active"].sum()),
         "loops": slam.loop_closer.loop_count,

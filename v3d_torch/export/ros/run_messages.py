@@ -93,7 +93,7 @@ class RunMessages:
         self._has_markers = True
         if slam.map.keyframe_at(stamp) is not None:
             yield "/cloud", self._cloud(frame, objects.static_without_people)
-            own = [each for each in slam.map.active_keyframes if not each.is_from_earlier_run]
+            own = slam.map.own_keyframes
             T_ml = frames.camera_in_map(invert(stack_poses(own)), self._T_mw)
             yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)
 
