@@ -23,7 +23,14 @@ from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
-from v3d_torch.runtime.batches import check_finite, common_batch, fill_indices, fill_padding, from_rows, to_rows
+from v3d_torch.runtime.batches import (
+    check_finite_arguments,
+    common_batch,
+    fill_indices,
+    fill_padding,
+    from_rows,
+    to_rows,
+)
 
 if TYPE_CHECKING:
     import pypose as pp
@@ -241,7 +248,7 @@ def _prepare(
     if valid is not None:
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
-    check_finite(T_wc=T_wc, T_ij=T_ij)
+    check_finite_arguments(T_wc=T_wc, T_ij=T_ij)
     weights = fill_padding(weights, valid, 0.0)
     batch = common_batch(
         T_wc.shape[:-3],

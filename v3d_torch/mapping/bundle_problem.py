@@ -25,7 +25,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import check_finite, common_batch, fill_indices, fill_padding
+from v3d_torch.runtime.batches import check_finite_arguments, common_batch, fill_indices, fill_padding
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -223,7 +223,7 @@ def prepare_bundle(
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])
     KORNIA_CHECK_SHAPE(point, ["*", str(pose.shape[-1])])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    check_finite(T_cw=T_cw, points=points)
+    check_finite_arguments(T_cw=T_cw, points=points)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)

@@ -57,11 +57,11 @@ def fill_indices(name: str, indices: Tensor, count: int, valid: Tensor | None) -
     return indices if valid is None else torch.where(valid, indices, 0)
 
 
-def check_finite(**values: Tensor) -> None:
-    """Check that values are finite, if they can be read at once: one that is not would make every step of a solver NaN.
+def check_finite_arguments(**values: Tensor) -> None:
+    """Check that arguments are finite, if they can be read at once: others would make every step of a solver NaN.
 
     Args:
-        values: Values by the name of the argument, any shape.
+        values: Arguments by name, any shape.
 
     Raises:
         InputError: If a value is NaN or infinite.
