@@ -47,13 +47,8 @@ def is_depth_file(path: Path) -> bool:
 
 
 def _read_npy(path: Path) -> NDArray[np.generic]:
-    return np.array(_open_npy(path))
-
-
-def _open_npy(path: Path) -> NDArray[np.generic]:
-    """Map a NumPy array into memory; only its header is read."""
     try:
-        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")  # never unpickles objects
+        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")  # reads only the header, never unpickles
     except OSError as error:
         if error.errno is None:
             raise InputError(f"{path}: is not a NumPy array; copy or export it again") from error
@@ -67,7 +62,7 @@ def _open_npy(path: Path) -> NDArray[np.generic]:
             f"{path}: is a NumPy array of {array.dtype} with shape {array.shape}, not a depth image; save depth with"
             " shape (H, W), as float32 in metres or as uint16"
         )
-    return array.squeeze()
+    return np.array(array.squeeze())
 
 
 def _read_exr(path: Path) -> NDArray[np.generic]:

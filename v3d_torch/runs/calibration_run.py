@@ -130,12 +130,9 @@ def calibration_table(calibration: Calibration) -> Table:
         given = "unknown" if each.given is None else f"{each.given:.6g}"
         is_known = math.isfinite(each.sigma) and math.isfinite(each.value)
         value, sigma = _format(each.value, each.sigma) if is_known else ("-", "-")
-        table.add_row(UNITS.get(each.name, "{}").format(each.name), given, value, sigma, _result(each))
+        result = "accepted" if each.accepted else f"not used: {each.reason}"
+        table.add_row(UNITS.get(each.name, "{}").format(each.name), given, value, sigma, result)
     return table
-
-
-def _result(estimate: Estimate) -> str:
-    return "accepted" if estimate.accepted else f"not used: {estimate.reason}"
 
 
 def _format(value: float, sigma: float) -> tuple[str, str]:
