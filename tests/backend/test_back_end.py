@@ -91,6 +91,19 @@ def test_flush_applies_the_pending_result_once(demo: RGBDSequence) -> None:
     assert slam(demo[5]).T_wc.isfinite().all()
 
 
+def test_loops_are_detected_from_the_adjusted_poses(demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=False))
+    given: list[Tensor] = []
+    monkeypatch.setattr(slam.loop_closer, "detect_loop", lambda *args: given.append(args[2]))
+    for frame, is_adjusted in ((0, False), (2, True)):
+        while len(slam.poses) <= frame:
+            slam(demo[len(slam.poses)])
+        result = slam.back_end.result()
+        assert result is not None and (result.adjustment is not None) is is_adjusted
+        assert torch.equal(given[-1], slam.map.T_cw if result.adjustment is None else result.adjustment.T_cw)
+        assert torch.equal(given[-1], slam.map.T_cw) is not is_adjusted
+
+
 def test_error_in_the_background_is_raised_with_the_next_frame(
     demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -12,7 +12,7 @@ from helpers.random_numbers import RandomNumbers
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
-from v3d_torch.backend.loop_closer import LoopCloser
+from v3d_torch.backend.loop_closer import LoopCloser, LoopCorrection
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.features.features import Features
@@ -20,7 +20,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.mapping.covisibility import count_shared_landmarks
 from v3d_torch.mapping.culling import cull_keyframes
-from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
 from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
@@ -267,6 +267,32 @@ def test_candidate_with_a_low_inlier_ratio_does_not_end_the_search(drifted: Came
         assert correction is not None
         places.append(correction.place.keyframe.index)
     assert places[0] != places[1] and max(places) <= 5  # both are at the beginning of the first lap
+
+
+def detect_in_drifted_map(drifted: Camera, gap: int) -> LoopCorrection | None:
+    """Detect a loop at the keyframe `LAP + 2` with a minimum number of keyframes between the ends of a loop."""
+    newest = drifted.map.keyframes[LAP + 2]
+    loop_closer = make_loop_closer(load_config(overrides=[f"loop.min_keyframe_gap={gap}"]))
+    loop_closer.rebuild_database(drifted.map.keyframes[: newest.index])
+    return loop_closer.detect_loop(newest, drifted.map, drifted.map.T_cw)
+
+
+def test_ends_of_a_loop_have_the_minimum_number_of_keyframes_between_them(drifted: Camera) -> None:
+    correction = detect_in_drifted_map(drifted, 10)
+    assert correction is not None
+    i, j = correction.loop.i, correction.loop.j
+    again, other = detect_in_drifted_map(drifted, j - i - 1), detect_in_drifted_map(drifted, j - i)
+    assert again is not None and again.loop.i == i
+    assert other is None or other.loop.i < i
+
+
+@pytest.mark.parametrize(("end", "found"), [(LAP + 2 - 10, True), (LAP + 2 - 9, False)])
+def test_loop_is_detected_again_when_the_last_one_is_old_enough(
+    drifted: Camera, end: int, found: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    T_cw = drifted.map.T_cw
+    monkeypatch.setattr(drifted.map, "loops", [Loop(0, end, T_cw[0] @ invert(T_cw[end]))])
+    assert (detect_in_drifted_map(drifted, 10) is not None) is found
 
 
 def test_different_rooms_form_no_loop() -> None:

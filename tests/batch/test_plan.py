@@ -22,6 +22,17 @@ def test_load_configs_drops_repetitions_and_limits_threads(tmp_path: Path) -> No
     assert [(config.threads, config.segmentation.threads) for config in (one, two)] == [(1, 1), (2, 2)]
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_configuration_that_two_paths_name_is_loaded_once(tmp_path: Path, order: int) -> None:
+    for name in ("mine.yaml", "sub/mine.yaml"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("threads: 2\n")
+    same = [str(tmp_path / "mine.yaml"), str(tmp_path / "sub" / ".." / "mine.yaml")]
+    assert list(load_configs(same[::order], one_thread=False)) == ["mine"]
+    with pytest.raises(ConfigError, match="another configuration is also named mine; rename the file"):
+        load_configs([same[0], str(tmp_path / "sub" / "mine.yaml")], one_thread=False)
+
+
 def test_configuration_without_map_is_rejected() -> None:
     check_configs([load_config()])
     with pytest.raises(ConfigError, match=r"^mapping\.enabled=false: there is no map to localise in; only `run` takes"):

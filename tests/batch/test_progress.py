@@ -34,5 +34,8 @@ def test_bars_show_all_running_jobs(moment: Path, tmp_path: Path) -> None:
         notes = [task.fields["note"] for task in progress.tasks]
         progress.table = Table("errors so far")
         progress.refresh()
+        show(JobRepeated(first, "its machine died"))
+        again = [(task.description, task.completed) for task in progress.tasks]
     assert "errors so far" in output.getvalue()
     assert shown == {"all runs": (6 + 5 + 6, 24), str(first): (5, 6)} and notes == ["2 of 4 runs", ""]
+    assert again == [("all runs", 6 + 6)]

@@ -25,6 +25,12 @@ def test_single_override_needs_no_list() -> None:
     assert load_config("paper", "seed=3") == load_config("paper", ["seed=3"])
 
 
+def test_seed_can_be_larger_than_other_numbers() -> None:
+    assert load_config(overrides=[f"seed={2**32}"]).seed == 2**32
+    with pytest.raises(ConfigError, match=r"features\.count: input should be between 1 and 1e\+06, got 4294967296"):
+        load_config(overrides=[f"features.count={2**32}"])
+
+
 def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
     config = load_config(None, ["objects.voting.time_spans=[0.0, 0.5]", "loop.enabled=false"])
     file = tmp_path / "config.yaml"

@@ -156,6 +156,16 @@ def test_landmarks_are_not_observed_on_what_moves(tmp_path: Path) -> None:
         assert model.points[number] is point
 
 
+def test_image_point_at_the_right_edge_has_the_colour_of_the_last_column(tmp_path: Path) -> None:
+    """It is rounded to the column behind the image."""
+    uv = torch.tensor([[CAMERA.width - 0.5, 60.0]] * 2, dtype=torch.float64)
+    tracks = LandmarkTracks(POINTS[:1], torch.tensor([0, 1]), torch.tensor([0, 0]), uv)
+    images = posed_images()
+    images[1].frame.image[:, 60, -1] = torch.tensor([10, 20, 30])
+    write_colmap(tmp_path, CAMERA, images, (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), tracks)
+    assert read_model(tmp_path / "sparse" / "0").points[1]["color"] == [10, 20, 30]
+
+
 def test_large_map_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("v3d_torch.export.colmap._MAX_POINTS", 4)
     points, colours = torch.arange(30.0).reshape(10, 3), torch.zeros(10, 3, dtype=torch.uint8)

@@ -23,6 +23,13 @@ def test_levels_are_below_each_other() -> None:
     np.testing.assert_array_equal(canvas[144:, :64], cv2.resize(second, (64, 51), interpolation=cv2.INTER_LINEAR))
 
 
+def test_last_column_of_a_level_is_repeated_beside_it() -> None:
+    canvas = ScalePyramid(100, 80, range(2), 1.25, 10).build(
+        np.random.default_rng(0).integers(0, 256, (80, 100), np.uint8)
+    )
+    np.testing.assert_array_equal(canvas[80:, 80:], canvas[80:, 79:80].repeat(20, axis=1))
+
+
 def test_boxes_are_the_levels_without_their_margin() -> None:
     pyramid = ScalePyramid(100, 80, range(3), 1.25, 10)
     assert pyramid.boxes.tolist() == [[10, 10, 90, 70], [10, 90, 70, 134], [10, 154, 54, 185]]
@@ -49,6 +56,8 @@ def test_large_image_is_averaged_not_sampled() -> None:
     assert np.abs(level.astype(int) - 127.5).max() < 40
 
 
-@pytest.mark.parametrize(("size", "levels"), [((20, 20), 1), ((48, 60), 1), ((50, 60), 2), ((640, 480), 8)])
+@pytest.mark.parametrize(
+    ("size", "levels"), [((20, 20), 1), ((48, 60), 1), ((60, 48), 1), ((50, 60), 2), ((640, 480), 8)]
+)
 def test_levels_without_pixels_inside_are_left_out(size: tuple[int, int], levels: int) -> None:
     assert len(ScalePyramid(*size, range(8), 1.2, 20).sizes) == levels

@@ -126,6 +126,11 @@ def test_image_ends_half_a_pixel_beyond_its_outermost_pixel_centres() -> None:
     torch.testing.assert_close(pixels[:2], inside)
 
 
+def test_point_at_the_minimum_depth_is_not_in_the_image() -> None:
+    points = torch.tensor([[0, 0, 0.3], [0, 0, 0.3 + 1e-9], [0, 0, 0.2], [0, 0, -1]], dtype=torch.float64)
+    assert FR3.project_to_image(points, 0.3)[1].tolist() == [False, True, False, False]
+
+
 def test_camera_accepts_numpy_and_torch_numbers() -> None:
     K = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
     distortion = np.array([[0.2624, -0.9531, -0.0054, 0.0026, 1.1633]])  # as cv2.calibrateCamera returns it

@@ -59,6 +59,7 @@ def test_estimate_of_a_room_is_found(scale: float, step: float) -> None:
         (stored(room(2.0, 7.0), 1000), "1 depth image with values from .* to .*, median .*, in steps of 1"),
         (stored(room(0.6, 1.8), 4000), "in steps of 1"),
         (stored(room(0.6, 4.5), 10000, 0.001), "in steps of 10"),  # or 2 mm in units of 0.2 mm
+        (stored(room(0.3, 2.4), 5000, 0.001), "in steps of 5"),  # or a hall of 12 m, in millimetres
         (np.full((48, 64), 5000, np.uint16), r"median 5000\)"),
         (np.zeros((48, 64), np.uint16), "1 depth image without measurements"),
         (np.full((48, 64), 65535, np.uint16), "1 depth image without measurements"),
@@ -73,6 +74,15 @@ def test_ambiguous_images_ask_for_the_depth_scale(image: NDArray[np.uint16], evi
 
 def test_no_images_give_no_estimate() -> None:
     assert estimate_depth_scale([]).depth_scale is None
+
+
+@pytest.mark.parametrize(("count", "expected"), [(29, None), (30, 5000.0)])
+def test_few_different_values_have_no_step(count: int, expected: float | None) -> None:
+    """They can be multiples of a number by chance."""
+    metres = np.random.default_rng(0).choice(np.linspace(0.6, 4.5, 3901), count, replace=False)
+    estimate = estimate_depth_scale([stored(np.resize(metres, (120, 4 * count)).repeat(4, axis=1), 5000, 0.001)])
+    assert estimate.depth_scale == expected
+    assert ("in steps of 5" in estimate.evidence) == (expected is not None)
 
 
 def test_few_interpolated_pixels_do_not_hide_the_step() -> None:

@@ -116,6 +116,11 @@ def test_interrupted_download_resumes(server: str, target: Path) -> None:
     assert target.read_bytes() == CONTENT
 
 
+def test_checksum_can_be_given_in_capital_letters(server: str, target: Path) -> None:
+    fetch(f"{server}/plain", target, sha256=SHA256.upper())
+    assert target.read_bytes() == CONTENT
+
+
 def test_download_restarts_if_the_server_has_no_ranges(server: str, target: Path) -> None:
     write_part(target, b"other bytes")
     fetch(f"{server}/plain", target, sha256=SHA256)

@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 from v3d_torch.errors import OutputError
-from v3d_torch.io.files import atomic_write, check_writable, file_lock, write_png, write_text
+from v3d_torch.io.files import (
+    atomic_write,
+    check_empty_folder,
+    check_writable,
+    emptied_on_failure,
+    file_lock,
+    write_png,
+    write_text,
+)
 
 
 def test_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
@@ -74,6 +82,31 @@ def test_unwritable_path_is_rejected_before_the_run(tmp_path: Path) -> None:
     for path in (tmp_path, tmp_path / "file" / "room.map"):
         with pytest.raises(OutputError, match="cannot be written"):
             check_writable(path)
+
+
+def test_only_a_new_or_empty_folder_is_empty(tmp_path: Path) -> None:
+    check_empty_folder(tmp_path / "new")
+    check_empty_folder(tmp_path)
+    (tmp_path / "file").write_text("old")
+    for path in (tmp_path, tmp_path / "file"):
+        with pytest.raises(OutputError, match=r"is not an empty folder; choose another folder with --out"):
+            check_empty_folder(path)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="symbolic links on Windows need special permissions")
+@pytest.mark.parametrize("is_new", [True, False])
+def test_failure_empties_the_folder_but_not_what_its_links_lead_to(tmp_path: Path, is_new: bool) -> None:
+    folder, own = tmp_path / "out", tmp_path / "own"
+    (own / "inside").mkdir(parents=True)
+    if not is_new:
+        folder.mkdir()
+    with pytest.raises(ZeroDivisionError), emptied_on_failure(folder):
+        (folder / "images").mkdir(parents=True)
+        (folder / "images" / "0.png").touch()
+        (folder / "link").symlink_to(own)
+        raise ZeroDivisionError
+    assert (own / "inside").is_dir() and folder.exists() is not is_new
+    assert is_new or not any(folder.iterdir())
 
 
 def test_convention_png_is_written_from_rgb(tmp_path: Path) -> None:

@@ -75,3 +75,12 @@ def test_groups_without_information_do_not_count() -> None:
     gradient, hessian = make_groups(6, seed=5)
     with_empty = [torch.cat([each, torch.zeros_like(each[:3])]) for each in (gradient, hessian)]
     torch.testing.assert_close(jackknife_covariance(*with_empty), jackknife_covariance(gradient, hessian))
+
+
+def test_groups_with_information_on_some_parameters_count() -> None:
+    gradient, hessian = make_groups(8, seed=6)
+    hessian = hessian * torch.eye(2)
+    gradient[1::2, 1], hessian[1::2, 1, 1] = 0.0, 0.0
+    without = torch.stack([minimum(gradient[torch.arange(8) != k], hessian[torch.arange(8) != k]) for k in range(8)])
+    change = without - minimum(gradient, hessian)
+    torch.testing.assert_close(jackknife_covariance(gradient, hessian), 7 / 8 * (change.T @ change) * 7 / 5)

@@ -80,3 +80,20 @@ def test_problems_of_a_batch_are_solved_as_alone() -> None:
         alone = levenberg_marquardt(start[k], *ROSENBROCK, iterations=50)
         assert alone.iterations == result.iterations[k] and alone.converged == result.converged[k]
         torch.testing.assert_close(alone.state, result.state[k], rtol=1e-9, atol=1e-9)
+
+
+def test_small_change_after_a_heavily_damped_step_is_not_convergence() -> None:
+    """The first steps go uphill, so that the damping is far above 1 when the first step is accepted."""
+
+    def parabola(x: Tensor) -> tuple[Tensor, Tensor]:
+        return 1e6 + x.square(), x
+
+    def step(x: Tensor, gradient: Tensor, damping: Tensor) -> Tensor:
+        return torch.where(damping < 10, x + 1000, x - gradient / (1 + damping))
+
+    result = levenberg_marquardt(torch.tensor(1.0, dtype=torch.float64), parabola, step, iterations=8)
+    assert result.iterations == 8 and not result.converged
+
+
+def test_student_t_scale_of_errors_that_are_all_zero_is_zero() -> None:
+    assert student_t_scale(torch.zeros(5), 5.0) == 0

@@ -23,7 +23,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.frame_result import FrameResult
-from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
 from v3d_torch.runs.results import write_results
@@ -81,6 +81,42 @@ def test_snapshots_of_a_stream_that_drops_frames_reach_from_its_first_to_its_las
         pipeline._keep_snapshot(Snapshot(replace(frame, index=2 * number + 1), torch.eye(4), nothing))
     kept = [snapshot.frame.index // 2 for snapshot in pipeline.record.snapshots]
     assert kept == list(range(0, 900, 128))
+
+
+def test_snapshots_of_a_stored_sequence_are_in_the_middle_of_equal_parts() -> None:
+    mask, pipeline = torch.ones(240, 320, dtype=torch.bool), make_pipeline()
+    frame, nothing = Wall()[0], cast("FrameResult", FrameObjects([], mask, mask, []))
+    pipeline.sequence = cast("Wall", range(24))
+    for number in range(24):
+        pipeline.slam = cast("V3DSLAM", SimpleNamespace(poses=range(number + 1)))
+        pipeline._keep_snapshot(Snapshot(replace(frame, index=number), torch.eye(4), nothing))
+    assert [snapshot.frame.index for snapshot in pipeline.record.snapshots] == [2, 6, 10, 14, 18, 22]
+
+
+def test_most_dynamic_snapshot_has_the_most_votes_for_dynamic_objects_then_the_most_objects() -> None:
+    mask, pipeline = torch.ones(240, 320, dtype=torch.bool), make_pipeline()
+    states = {1: MotionState.DYNAMIC, 2: MotionState.STATIC, 3: MotionState.STATIC}
+    objects = [cast("TrackedObject", SimpleNamespace(id=id, motion_state=state)) for id, state in states.items()]
+    votes = [
+        (objects, [(1, 2), (1, 3), (2, 1)]),
+        (objects[:2], [(2, 1), (3, 1)]),
+        (objects, [(1, 2), (2, 1), (3, 1)]),
+        (objects, [(2, 1), (3, 1)]),
+        (objects, [(1, 2), (1, 3), (2, 3), (3, 2)]),
+    ]
+    most_dynamic = []
+    for index, (found, pairs) in enumerate(votes):
+        result = cast("FrameResult", FrameObjects(found, mask, mask, pairs))
+        pipeline._keep_snapshot(Snapshot(replace(Wall()[0], index=index), torch.eye(4), result))
+        most_dynamic.append(cast("Snapshot", pipeline.record.most_dynamic_snapshot).frame.index)
+    assert most_dynamic == [0, 1, 2, 2, 2]
+
+
+def test_warning_is_logged_and_recorded_once(caplog: pytest.LogCaptureFixture) -> None:
+    pipeline = make_pipeline()
+    pipeline.warn(["dark", "blurred", "dark"])
+    pipeline.warn(["dark", "red and blue are exchanged"])
+    assert pipeline.record.warnings == caplog.messages == ["dark", "blurred", "red and blue are exchanged"]
 
 
 @pytest.mark.parametrize("broken", [0, 1, 5])

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import numpy as np
+import pytest
 import torch
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
-from v3d_torch.pipeline.run_record import FrameTimes, ObjectTable
+from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.types import RGBDFrame
 
@@ -34,3 +36,12 @@ def test_values_of_an_object_without_a_centroid_are_nan() -> None:
     table.append_objects(frame, FrameObjects([chair], mask, mask, []), torch.tensor([0.0, -1.0, 0.0]))
     for column in ("centroid", "velocity", "sigmas", "box"):
         assert table[column].isnan().all(), column
+
+
+def test_latency_statistics_are_those_of_numpy() -> None:
+    table = LiveTable()
+    assert table.latency_statistics() is None
+    latency = torch.rand(101, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    table.append(latency=latency, dropped=torch.zeros(101, dtype=torch.int64))
+    expected = {"median": np.median(latency), "p95": np.percentile(latency, 95), "max": np.max(latency.numpy())}
+    assert table.latency_statistics() == pytest.approx(expected)

@@ -152,6 +152,16 @@ def test_vertex_colours_equal_the_colours_of_the_views(room: Mesh) -> None:
     assert difference.quantile(0.95) < 4  # of 255: a pixel is 1 cm wide
 
 
+def test_colour_of_an_object_in_front_of_a_surface_is_not_that_of_the_surface() -> None:
+    """A red panel covers the whole wall in another view."""
+    views = flat(2.0)
+    red = torch.tensor([255, 0, 0], dtype=torch.uint8)[:, None, None].expand(3, 240, 320)
+    views.add(keyframe(frame=1), red, torch.ones(1, 240, 320), ALL)
+    mesh = fuse_mesh(views, CONFIG)
+    wall = mesh.vertices[:, 2] > 1.9
+    assert wall.sum() > 1000 and (mesh.colours[wall] == 128).all()
+
+
 def test_mesh_is_closed_except_at_its_boundary() -> None:
     """Each inner edge has a triangle on both sides, also between tiles."""
     mesh = fuse_mesh(views_of(looking_around(12)), CONFIG)

@@ -102,3 +102,16 @@ def test_error_of_the_program_in_the_thread_ends_the_run_but_not_the_final_resul
     autosave._due = 0.0
     with pytest.raises(ZeroDivisionError):
         autosave()
+
+
+@pytest.mark.parametrize("limits", [("interval=1000", "max_time_fraction=1"), ("interval=0", "max_time_fraction=1e-6")])
+def test_next_save_is_due_after_the_interval_and_after_the_maximum_fraction_of_time(
+    limits: tuple[str, str], tmp_path: Path
+) -> None:
+    pipeline = run_along_wall(*(f"checkpoint.{limit}" for limit in limits))
+    autosave = Autosave(tmp_path, pipeline, None)
+    autosave._due = 0.0
+    autosave()
+    (tmp_path / "trajectory.txt").unlink()
+    autosave()
+    assert not (tmp_path / "trajectory.txt").exists()

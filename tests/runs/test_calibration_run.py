@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from io import StringIO
 
 import pytest
@@ -10,7 +11,7 @@ from rich.console import Console
 
 from v3d_torch.calibration.camera_calibration import Calibration
 from v3d_torch.calibration.selection import Estimate
-from v3d_torch.runs.calibration_run import UNITS, calibration_table, calibration_text
+from v3d_torch.runs.calibration_run import UNITS, _is_converged, calibration_table, calibration_text
 
 
 def calibrated(*estimates: Estimate) -> Calibration:
@@ -45,3 +46,24 @@ def test_names_of_parameters_are_not_broken_at_80_columns() -> None:
     console.print(calibration_table(calibrated(*estimates)))
     text = console.export_text()
     assert all(unit.format(name) in text for name, unit in UNITS.items())
+
+
+@pytest.mark.parametrize(("change", "converged"), [(0.0, True), (-4.9, True), (5.1, False), (-15.0, False)])
+def test_runs_are_converged_if_no_estimate_changes_by_more_than_half_its_deviation(
+    change: float, converged: bool
+) -> None:
+    before, after = (
+        calibrated(
+            Estimate("fx", 525.0, fx, 10.0, accepted=True, reason=""),
+            Estimate("cx", 320.0, cx, 1.0, accepted=False, reason="not determined by the recording"),
+        )
+        for fx, cx in ((530.0, 300.0), (530.0 + change, 340.0))
+    )
+    assert _is_converged(after, CAMERA, before) is converged
+    assert not _is_converged(after, CAMERA, None) and not _is_converged(calibrated(), CAMERA, before)
+
+
+def test_runs_are_not_converged_if_other_focal_lengths_explain_the_images_better() -> None:
+    same = calibrated()
+    assert _is_converged(same, CAMERA, same)
+    assert not _is_converged(replace(same, next_camera=replace(CAMERA, fx=CAMERA.fx + 1)), CAMERA, same)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from v3d_torch.runs.log import log_to
+from v3d_torch.runs.log import log_to, show_warnings
 
 LOG = logging.getLogger("v3d_torch.test")
 
@@ -48,3 +48,13 @@ def test_new_log_replaces_a_link_and_keeps_its_target(tmp_path: Path) -> None:
         LOG.warning("a frame is broken")
     assert (tmp_path / "notes.txt").read_text() == "own notes"
     assert (tmp_path / "run.log").read_text().endswith("a frame is broken\n")
+
+
+def test_only_warnings_are_shown_not_errors(tmp_path: Path) -> None:
+    shown: list[str] = []
+    with log_to(tmp_path / "run.log"), show_warnings(shown.append):
+        LOG.info("a note")
+        LOG.warning("%s is dark", "the image")
+        LOG.error("the run failed")
+    LOG.warning("later")
+    assert shown == ["warning: the image is dark"]

@@ -51,6 +51,22 @@ def test_invalid_frame_is_rejected(frame: RGBDFrame, message: str) -> None:
         make_slam()(frame)
 
 
+@pytest.mark.parametrize(
+    ("gravity", "found"),
+    [
+        (torch.tensor([0, 1.01, 0], dtype=torch.float64), r"\[0\.0, 1\.01, 0\.0\]"),
+        (torch.tensor([0, torch.nan, 1], dtype=torch.float64), r"\[0\.0, nan, 1\.0\]"),
+        (torch.ones(1, dtype=torch.float64), r"torch\.float64 of shape \(1,\), expected .* of shape \(3,\)"),
+        (torch.tensor([0.0, 1.0, 0.0]), r"torch\.float32 of shape \(3,\), expected a tensor, torch\.float64"),
+        (np.array([0.0, 1.0, 0.0]), "a ndarray"),
+    ],
+)
+def test_gravity_that_is_no_unit_vector_is_rejected(gravity: Any, found: str) -> None:
+    with pytest.raises(InputError, match=f"frame 7: the gravity is {found}.*; give a unit vector in the camera frame"):
+        make_slam()(replace(FRAME, gravity=gravity))
+    make_slam()(replace(FRAME, gravity=torch.tensor([0, 1.0005, 0], dtype=torch.float64)))
+
+
 def test_valid_frames_are_tracked_with_and_without_a_camera() -> None:
     slam = make_slam(lambda _: INSTANCES)
     assert slam.camera == CAMERA

@@ -135,16 +135,6 @@ def test_labels_at_the_same_place_do_not_cover_each_other() -> None:
     assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 + 1 for box in boxes)
 
 
-def test_label_without_a_place_is_hidden() -> None:
-    figure = Figure(figsize=(2, 1))
-    axes = figure.add_subplot()
-    for number in range(30):
-        axes.annotate(f"name {number}", (0.5, 0.5))
-    separate_labels(figure)
-    shown = [text for text in axes.texts if text.get_visible()]
-    assert 1 <= len(shown) < 10
-
-
 def test_labels_stay_inside_the_image_and_those_left_out_are_counted(tmp_path: Path) -> None:
     mask = torch.zeros(48, 64, dtype=torch.bool)
     mask[44:, 20:40] = True

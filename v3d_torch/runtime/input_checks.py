@@ -69,10 +69,12 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
         if not math.isfinite(seconds):
             raise InputError(f"frame {frame.index}: the {name} is {seconds}; give a finite number of seconds")
     gravity = frame.gravity
-    if gravity is not None and (gravity.shape != (3,) or not abs(float(gravity.norm()) - 1) < _MAX_NORM_ERROR):
-        raise InputError(
-            f"frame {frame.index}: the gravity is {gravity.tolist()}; give a unit vector in the camera frame"
-        )
+    if gravity is not None:
+        wrong = describe_wrong_tensor(gravity, (3,), torch.float64)
+        if wrong is None and not abs(float(gravity.norm()) - 1) < _MAX_NORM_ERROR:
+            wrong = str(gravity.tolist())
+        if wrong is not None:
+            raise InputError(f"frame {frame.index}: the gravity is {wrong}; give a unit vector in the camera frame")
     if frame.camera is not None and frame.camera != camera:
         raise InputError(
             f"frame {frame.index}: its camera differs from that of the V3DSLAM; make one V3DSLAM for each camera"

@@ -51,7 +51,8 @@ def _separate(axes: Axes) -> int:
         patch = label.get_bbox_patch()
         if patch is not None:
             start = Bbox.union([start, patch.get_window_extent()])
-        box = start.translated(min(axes.bbox.x1 - start.x1, 0.0), max(axes.bbox.y0 - start.y0, 0.0))
+        left, bottom = min(start.x0, axes.bbox.x1 - start.width), max(start.y0, axes.bbox.y0)
+        box = Bbox.from_bounds(left, bottom, start.width, start.height)
         while any(box.overlaps(other) for other in boxes):
             box = box.translated(0.0, -0.5 * box.height)
         if box.y0 < axes.bbox.y0:
