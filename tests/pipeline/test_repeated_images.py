@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, Wall, square
+from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, square
 from torch import Tensor
 
 from v3d_torch.pipeline import Pipeline
@@ -89,3 +89,21 @@ def test_run_with_repeated_images_has_a_warning() -> None:
     pipeline()
     pipeline.flush()
     assert any(f"{FRAMES} of {2 * FRAMES} images are equal" in warning for warning in pipeline.record.warnings)
+
+
+class StuckDepth(Wall):
+    """The wall with a depth camera that delivers its first image, with noise, again and again."""
+
+    noise = WALL + 0.01 * torch.rand(1, 240, 320, generator=torch.Generator().manual_seed(0))
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        return replace(super().__getitem__(index), depth=self.noise.clone())
+
+
+@pytest.mark.parametrize(("sequence", "is_warned_of"), [(StuckDepth(), True), (Wall(), False)])
+def test_run_with_one_depth_image_has_a_warning(sequence: Wall, is_warned_of: bool) -> None:
+    pipeline = Pipeline(sequence, V3DSLAM(CAMERA, square))
+    pipeline()
+    pipeline.flush()
+    text = f"all {FRAMES} depth images are equal: the stream seems to be stuck"
+    assert any(text in warning for warning in pipeline.record.warnings) == is_warned_of

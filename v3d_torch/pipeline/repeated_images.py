@@ -23,32 +23,37 @@ class RepeatedImages:
 
     Attributes:
         count: Number of such images so far.
-        newest: Newest image, uint8, shape :math:`(3, H, W)`; None before the first one.
+        newest: Newest image, shape :math:`(C, H, W)`; None before the first one.
     """
 
     count: int = 0
     newest: Tensor | None = None
 
     def add(self, image: Tensor) -> None:
-        """Compare an image with the one before, uint8, shape :math:`(3, H, W)`."""
+        """Compare a colour or depth image with the one before, shape :math:`(C, H, W)`."""
         if self.newest is not None and self.newest.shape == image.shape:
             sampled = (each[:, ::_STRIDE, ::_STRIDE] for each in (self.newest, image))
             self.count += torch.equal(*sampled) and torch.equal(self.newest, image) and not _is_uniform(image)
         self.newest = image
 
-    def check(self, frames: int) -> list[str]:
-        """Return a warning if many of the frames repeat the one before: the camera stops, or its stream is stuck."""
+    def check(self, frames: int, images: str = "images") -> list[str]:
+        """Return a warning if many of the images repeat the one before: the camera stops, or its stream is stuck.
+
+        Args:
+            frames: Number of images.
+            images: Name of the images in the warning.
+        """
         if self.count <= _MIN_FRACTION * frames:
             return []
         if self.count == frames - 1:
             if frames < _MIN_FRAMES:
                 return []
             return [
-                f"all {frames} images are equal: the stream seems to be stuck, because images of a camera have noise;"
+                f"all {frames} {images} are equal: the stream seems to be stuck, because images of a camera have noise;"
                 " record or export them again"
             ]
         return [
-            f"{self.count} of {frames} images are equal to the one before: the camera seems to stop and jump, which"
+            f"{self.count} of {frames} {images} are equal to the one before: the stream seems to stop and jump, which"
             " makes velocities, readout and path less accurate; leave out the copies"
         ]
 
