@@ -108,3 +108,44 @@ def test_steps_of_other_cameras_are_not_compared_with_a_kinect() -> None:
 def test_warning_about_depth_outside_the_range_of_cameras(scale: float, text: str) -> None:
     warnings = [each for each in check(*make_views(6, scale=scale)) if "depth_scale" in each]
     assert len(warnings) == 1 and warnings[0].endswith(f"the depth_scale 5000 seems to be {text}")
+
+
+def constant_views(constant: int, of: int, *, moving: bool = True) -> tuple[StaticViews, Trajectory]:
+    """Views of which the first have a depth of 2 m at all pixels but one."""
+    views, trajectory = make_views(of, moving=moving)
+    changed = StaticViews(CAMERA, 2)
+    for number, view in enumerate(views):
+        units = torch.full((120, 160), round(2 / STORED_UNIT)).to(torch.uint16)
+        units[0, 0] = 1
+        changed.append(replace(view, depth_units=units) if number < constant else view)
+    return changed, trajectory
+
+
+@pytest.mark.parametrize(("constant", "of"), [(2, 2), (4, 4), (3, 4)])
+def test_warning_about_constant_depth_and_nothing_else(constant: int, of: int) -> None:
+    wrong = replace(TRUE, fx=2 * TRUE.fx, fy=2 * TRUE.fy, cx=2 * TRUE.cx, cy=2 * TRUE.cy)
+    (warning,) = check(*constant_views(constant, of), make_map(wrong, noise=0.3), wrong)
+    assert warning.startswith("the depth is 2 m at nearly all pixels of an image")
+
+
+@pytest.mark.parametrize(
+    ("constant", "of", "moving"),
+    [
+        (2, 4, True),  # half of the views
+        (1, 1, True),
+        (4, 4, False),  # a plane in front of a camera that does not turn
+    ],
+)
+def test_constant_depth_that_can_be_true_is_not_warned_of(constant: int, of: int, moving: bool) -> None:
+    warnings = check(*constant_views(constant, of, moving=moving))
+    assert not any("nearly all pixels" in warning for warning in warnings)
+
+
+def test_a_few_pixels_of_equal_depth_are_not_warned_of() -> None:
+    views, trajectory = make_views(4)
+    sparse = StaticViews(CAMERA, 2)
+    for view in views:
+        units = torch.zeros(120, 160).to(torch.uint16)
+        units[5, 5:25] = round(2 / STORED_UNIT)
+        sparse.append(replace(view, depth_units=units))
+    assert check(sparse, trajectory) == []

@@ -1,4 +1,4 @@
-"""Images that repeat the one before: counted, and warned of if the others move."""
+"""Images that repeat the one before: counted, and warned of if they are many or all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, Wall, square
+from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, square
 from torch import Tensor
 
 from v3d_torch.pipeline import Pipeline
@@ -27,7 +27,6 @@ def picture(seed: int) -> Tensor:
         ([*range(20), *range(18, 38)], 0, False),  # an image that returns is no repetition
         ([0, 0, *range(1, 39)], 1, False),
         ([number // 2 for number in range(40)], 20, True),
-        ([0] * 40, 39, False),  # a still camera without noise
         ([*[0] * 30, *range(1, 11)], 29, True),
     ],
 )
@@ -40,6 +39,28 @@ def test_many_repeated_images_are_warned_of(numbers: list[int], count: int, is_w
     assert [warning.startswith(f"{count} of {len(numbers)} images are equal") for warning in warnings] == (
         [True] * is_warned_of
     )
+
+
+@pytest.mark.parametrize(("frames", "is_warned_of"), [(2, False), (9, False), (10, True), (40, True)])
+def test_a_stream_of_one_image_is_stuck(frames: int, is_warned_of: bool) -> None:
+    """Also a camera that stands still has noise, and a few frames can be a test."""
+    repeated = RepeatedImages()
+    for _ in range(frames):
+        repeated.add(picture(0))
+    warnings = repeated.check(frames)
+    assert [f"all {frames} images are equal: the stream seems to be stuck" in warning for warning in warnings] == (
+        [True] * is_warned_of
+    )
+
+
+@pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (10, 20, 30)])
+def test_uniform_images_are_no_repetition(colour: tuple[int, int, int]) -> None:
+    """Images in the dark are equal, but nobody copied them."""
+    repeated = RepeatedImages()
+    repeated.add(picture(0))
+    for _ in range(39):
+        repeated.add(torch.tensor(colour, dtype=torch.uint8)[:, None, None].expand(3, 48, 64))
+    assert repeated.count == 0 and repeated.check(40) == []
 
 
 def test_one_pixel_makes_another_image() -> None:
@@ -68,3 +89,21 @@ def test_run_with_repeated_images_has_a_warning() -> None:
     pipeline()
     pipeline.flush()
     assert any(f"{FRAMES} of {2 * FRAMES} images are equal" in warning for warning in pipeline.record.warnings)
+
+
+class StuckDepth(Wall):
+    """The wall with a depth camera that delivers its first image, with noise, again and again."""
+
+    noise = WALL + 0.01 * torch.rand(1, 240, 320, generator=torch.Generator().manual_seed(0))
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        return replace(super().__getitem__(index), depth=self.noise.clone())
+
+
+@pytest.mark.parametrize(("sequence", "is_warned_of"), [(StuckDepth(), True), (Wall(), False)])
+def test_run_with_one_depth_image_has_a_warning(sequence: Wall, is_warned_of: bool) -> None:
+    pipeline = Pipeline(sequence, V3DSLAM(CAMERA, square))
+    pipeline()
+    pipeline.flush()
+    text = f"all {FRAMES} depth images are equal: the stream seems to be stuck"
+    assert any(text in warning for warning in pipeline.record.warnings) == is_warned_of

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import re
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -88,3 +90,34 @@ def test_run_that_never_finds_the_camera_stores_the_cause_and_no_scores(
     page = render_page(read_run(tmp_path))
     assert all(text.count(cause) == 1 for text in (metrics["diagnosis"], caplog.text, page))
     assert "ATE RMSE" not in page and "The camera was not found in any frame" in page
+
+
+class Covered(Wall):
+    """The wall as seen by a camera whose lens is covered after some frames."""
+
+    def __init__(self, frames: int) -> None:
+        super().__init__()
+        self._frames = frames
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return map(self.__getitem__, range(FRAMES))
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame = super().__getitem__(index)
+        return frame if index < self._frames else replace(frame, image=torch.zeros_like(frame.image))
+
+
+@pytest.mark.parametrize("frames", [1, 6])
+def test_cause_of_the_loss_of_most_frames_is_a_warning(tmp_path: Path, frames: int) -> None:
+    """The cause is that of the lost frames; it is no error, because the poses of the others are right."""
+    run = Run(RunRequest("wall", Config()), Covered(frames), square, tmp_path)
+    run(lambda *_: None)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    text = f"{FRAMES - frames} of {FRAMES} frames are lost: the colour images are uniform;"
+    assert sum(warning.startswith(text) for warning in metrics["warnings"]) == 1 and metrics["diagnosis"] is None
+
+
+def test_loss_of_few_frames_has_no_warning(tmp_path: Path) -> None:
+    run = Run(RunRequest("wall", Config()), Covered(FRAMES - 4), square, tmp_path)
+    run(lambda *_: None)
+    assert not any("are lost" in warning for warning in run.pipeline.record.warnings)

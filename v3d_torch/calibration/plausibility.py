@@ -6,6 +6,7 @@ contradict the camera significantly.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -18,7 +19,7 @@ from v3d_torch.calibration.people_size import check_people_size
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.map_tables import MapTables
-from v3d_torch.mapping.static_views import StaticViews
+from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.types import Trajectory
 
 _FIRST_VIEWS, _MAX_VIEWS = 8, 32
@@ -61,6 +62,16 @@ _MIN_VIEWS = 5
 _DEPTH_VIEWS = 4
 """Number of views whose depth is examined."""
 
+_MIN_MEASURED = 100
+"""Minimum number of pixels with depth of a view whose depth can be constant; fewer can be equal by chance."""
+
+_MOST = (0.01, 0.99)
+"""Quantiles between which nearly all depth of a view lies: single pixels can be wrong."""
+
+_MIN_TURN = 0.05
+"""Angle between optical axes above which a plane cannot have the same depth at all pixels of both views, radians: at a
+distance of 2 m it makes a difference of a decimetre."""
+
 _FAR = (2.5, 10.0)
 """Depths for a warning that depth is too large, metres: 99 % of the measurements exceed the first, and 1 % the second.
 RGB-D cameras measure up to about 10 m."""
@@ -90,11 +101,43 @@ def check_plausibility(
     Returns:
         One sentence with the likely cause for each contradiction.
     """
+    if constant := _check_constant_depth(views):
+        return constant  # no path agrees with it, so that the focal lengths would seem to be wrong
     registration = _check_registration(views, trajectory, camera)
     # If depth is not registered, no focal length fits.
     focal_length = [] if registration else _check_focal_length(tables, camera, config)
     depth_scale = _check_depth_scale(views, camera) or check_people_size(people_sizes, camera)
     return [*depth_scale, *registration, *focal_length]
+
+
+def _examined_views(views: StaticViews) -> list[StaticView]:
+    """Return some views at equal intervals."""
+    own = views.own
+    return own[:: max(-(-len(own) // _DEPTH_VIEWS), 1)]
+
+
+def _measured(view: StaticView) -> Tensor:
+    """Depth of the pixels that have depth, metres, (N,)."""
+    return view.depth[view.depth > 0]
+
+
+def _check_constant_depth(views: StaticViews) -> list[str]:
+    """Check whether most views have the same depth at nearly all pixels, although the camera turns.
+
+    Only a plane has the same depth everywhere, and only from one direction.
+    """
+    examined = [view for view in _examined_views(views) if len(_measured(view)) >= _MIN_MEASURED]
+    ranges = [_measured(view).quantile(torch.tensor(_MOST)).tolist() for view in examined]
+    constant = [view for view, (low, high) in zip(examined, ranges, strict=True) if low == high]
+    if 2 * len(constant) <= len(examined):
+        return []
+    axes = torch.stack([view.T_cw[2, :3] for view in constant])  # optical axes in the world frame
+    if float((axes @ axes.T).min()) > math.cos(_MIN_TURN):
+        return []
+    return [
+        f"the depth is {float(_measured(constant[-1]).median()):.2g} m at nearly all pixels of an image although the"
+        " camera turns; record or export the depth images again"
+    ]
 
 
 def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
@@ -104,9 +147,7 @@ def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
     """
     if camera.depth_scale is None:
         return []
-    own = views.own
-    step = max(-(-len(own) // _DEPTH_VIEWS), 1)
-    depth = torch.cat([torch.zeros(0), *(view.depth[view.depth > 0] for view in own[::step])])
+    depth = torch.cat([torch.zeros(0), *map(_measured, _examined_views(views))])
     if not len(depth):
         return []
     ratio = _kinect_step_ratio(depth, camera)

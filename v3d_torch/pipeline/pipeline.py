@@ -149,14 +149,16 @@ class Pipeline:
         if not self.record.was_checked:
             self._check_plausibility()
         self.warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
-        self.warn(self.record.repeated.check(len(self.slam.poses)))
+        frames = len(self.slam.poses)
+        self.warn(self.record.repeated.check(frames))
+        self.warn(self.record.repeated_depth.check(frames, "depth images"))
         if self.slam.occupancy is not None:
             self.slam.occupancy.correct(self.slam.poses)
         disconnected = self.slam.poses.statuses.count(TrackingStatus.DISCONNECTED)
         if disconnected:
             self.warn(
                 [
-                    f"{disconnected} of {len(self.slam.poses)} frames belong to a part of the map whose place is only a"
+                    f"{disconnected} of {frames} frames belong to a part of the map whose place is only a"
                     " guess: point map and mesh leave it out; return to a known place to join the parts"
                 ]
             )
@@ -234,6 +236,7 @@ class Pipeline:
 
     def _record_frame(self, frame: RGBDFrame, result: FrameResult) -> None:
         self.record.repeated.add(frame.image)
+        self.record.repeated_depth.add(frame.depth)
         self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result, self.slam.up)
         with self._stopwatch.paused():  # no part of the system, whose rate is measured

@@ -13,31 +13,51 @@ _STRIDE = 16
 _MIN_FRACTION = 0.05
 """Fraction of repeated images above which they are warned of: a few do not change the path."""
 
+_MIN_FRAMES = 10
+"""Minimum number of images for a warning that all are equal: also a short test can repeat one image."""
+
 
 @dataclass
 class RepeatedImages:
-    """Counts images that equal the one before.
+    """Counts images that equal the one before, without uniform images: all images in the dark are equal.
 
     Attributes:
         count: Number of such images so far.
-        newest: Newest image, uint8, shape :math:`(3, H, W)`; None before the first one.
+        newest: Newest image, shape :math:`(C, H, W)`; None before the first one.
     """
 
     count: int = 0
     newest: Tensor | None = None
 
     def add(self, image: Tensor) -> None:
-        """Compare an image with the one before, uint8, shape :math:`(3, H, W)`."""
+        """Compare a colour or depth image with the one before, shape :math:`(C, H, W)`."""
         if self.newest is not None and self.newest.shape == image.shape:
             sampled = (each[:, ::_STRIDE, ::_STRIDE] for each in (self.newest, image))
-            self.count += torch.equal(*sampled) and torch.equal(self.newest, image)
+            self.count += torch.equal(*sampled) and torch.equal(self.newest, image) and not _is_uniform(image)
         self.newest = image
 
-    def check(self, frames: int) -> list[str]:
-        """Return a warning if many of the frames repeat the one before, but not all: then nothing moves."""
-        if not _MIN_FRACTION * frames < self.count < frames - 1:
+    def check(self, frames: int, images: str = "images") -> list[str]:
+        """Return a warning if many of the images repeat the one before: the camera stops, or its stream is stuck.
+
+        Args:
+            frames: Number of images.
+            images: Name of the images in the warning.
+        """
+        if self.count <= _MIN_FRACTION * frames:
             return []
+        if self.count == frames - 1:
+            if frames < _MIN_FRAMES:
+                return []
+            return [
+                f"all {frames} {images} are equal: the stream seems to be stuck, because images of a camera have noise;"
+                " record or export them again"
+            ]
         return [
-            f"{self.count} of {frames} images are equal to the one before: the camera seems to stop and jump, which"
+            f"{self.count} of {frames} {images} are equal to the one before: the stream seems to stop and jump, which"
             " makes velocities, readout and path less accurate; leave out the copies"
         ]
+
+
+def _is_uniform(image: Tensor) -> bool:
+    """Check whether all pixels of an image, shape (C, H, W), are equal."""
+    return bool((image == image[:, :1, :1]).all())

@@ -234,7 +234,8 @@ class RunRecord:
         save_error: Reason why a checkpoint could not be written; None if there was no error.
         warnings: Contradictions between the images and the camera, notes on the source, and map files that were not
             written, one sentence each.
-        repeated: Images that repeat the one before.
+        repeated: Colour images that repeat the one before.
+        repeated_depth: Depth images that repeat the one before.
         people_sizes: Apparent sizes of people in the keyframes before the check, metres.
         was_checked: True if camera and depth were checked.
     """
@@ -256,6 +257,7 @@ class RunRecord:
     save_error: str | None = None
     warnings: list[str] = field(default_factory=list)
     repeated: RepeatedImages = field(default_factory=RepeatedImages)
+    repeated_depth: RepeatedImages = field(default_factory=RepeatedImages)
     people_sizes: list[float] = field(default_factory=list)
     was_checked: bool = False
 

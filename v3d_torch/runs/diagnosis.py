@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.stored import StoredSequence
@@ -11,7 +13,7 @@ from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.request import RunRequest
-from v3d_torch.types import RGBDFrame
+from v3d_torch.types import RGBDFrame, TrackingStatus
 
 _SAMPLES = 5
 """Number of frames that are examined."""
@@ -24,6 +26,9 @@ _MAX_EMPTY_FRACTION = 0.01
 
 _MIN_IMAGE_SIZE = 96
 """Minimum number of rows and of columns of an image in which enough features are found in most scenes."""
+
+_OTHER_MAP = "pass a map of the same place, or run without --load-map"
+"""Fix of a run whose frames are not localised in a known map."""
 
 
 def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | None) -> str | None:
@@ -43,17 +48,33 @@ def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | N
     if pipeline.slam.poses.is_localised:
         return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
     if request.load_map is not None:
-        return (
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
-            " run without --load-map"
-        )
-    return f"{name}: the camera was not found in any of the {count} frames, {_cause_of_loss(pipeline)}"
+        return f"{request.load_map}: no frame of {request.seq} was localised in this map; {_OTHER_MAP}"
+    cause = _cause_of_loss(pipeline, request, pipeline.record.times.indices)
+    return f"{name}: the camera was not found in any of the {count} frames, {cause}"
 
 
-def _cause_of_loss(pipeline: Pipeline) -> str:
+def check_lost_frames(pipeline: Pipeline, request: RunRequest) -> list[str]:
+    """Check whether a run that reached the end of its sequence lost more than half of the frames, but not all.
+
+    Args:
+        pipeline: Pipeline that has run.
+        request: Inputs of the run.
+
+    Returns:
+        A sentence with cause and fix, or nothing.
+    """
+    statuses = pipeline.slam.poses.statuses
+    lost = torch.tensor([status is TrackingStatus.LOST for status in statuses], dtype=torch.bool)
+    if not len(statuses) / 2 < int(lost.sum()) < len(statuses):
+        return []
+    cause = _cause_of_loss(pipeline, request, pipeline.record.times.indices[lost])
+    return [f"{int(lost.sum())} of {len(statuses)} frames are lost: {cause}"]
+
+
+def _cause_of_loss(pipeline: Pipeline, request: RunRequest, indices: Tensor) -> str:
+    """Return cause and fix of the loss of frames, given by their indices in the sequence, int64, (N,)."""
     sequence, max_depth = pipeline.sequence, pipeline.slam.config.features.max_depth
     if isinstance(sequence, RGBDSequence):
-        indices = pipeline.record.times.indices
         samples = np.linspace(0, len(indices) - 1, min(_SAMPLES, len(indices))).astype(int)
         frames = [sequence[int(indices[sample])] for sample in samples]
         if all(float(frame.image.float().std()) < _MAX_PLAIN_SIGMA for frame in frames):
@@ -74,6 +95,8 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
                 f"nearly all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise"
                 " features.max_depth"
             )
+    if request.load_map is not None:
+        return f"they were not localised in {request.load_map}; {_OTHER_MAP}"
     if min(sequence.camera.width, sequence.camera.height) < _MIN_IMAGE_SIZE:
         return (
             f"images of {sequence.camera.width}x{sequence.camera.height} pixels have too few features; use images of at"
@@ -86,7 +109,7 @@ def _cause_of_loss(pipeline: Pipeline) -> str:
                 f"at most {most} features of an image have depth, and a map starts with mapping.min_tracked={needed};"
                 " lower it, raise features.count, or record it again with more texture in view"
             )
-    if len(pipeline.record.dynamics):
+    if bool(torch.isin(pipeline.record.dynamics["frame"], indices).any()):
         return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 
