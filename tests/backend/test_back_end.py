@@ -25,6 +25,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
+from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.pipeline import Pipeline
 
 FRAMES = 6
@@ -94,7 +95,11 @@ def test_flush_applies_the_pending_result_once(demo: RGBDSequence) -> None:
 def test_loops_are_detected_from_the_adjusted_poses(demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch) -> None:
     slam = V3DSLAM(demo.camera, config=make_config(in_background=False))
     given: list[Tensor] = []
-    monkeypatch.setattr(slam.loop_closer, "detect_loop", lambda *args: given.append(args[2]))
+
+    def detect_loop(keyframe: Keyframe, sparse_map: SparseMap, T_cw: Tensor) -> None:
+        given.append(T_cw)
+
+    monkeypatch.setattr(slam.loop_closer, "detect_loop", detect_loop)
     for frame, is_adjusted in ((0, False), (2, True)):
         while len(slam.poses) <= frame:
             slam(demo[len(slam.poses)])

@@ -110,9 +110,9 @@ def test_warning_about_depth_outside_the_range_of_cameras(scale: float, text: st
     assert len(warnings) == 1 and warnings[0].endswith(f"the depth_scale 5000 seems to be {text}")
 
 
-def constant_views(constant: int, of: int, *, moving: bool = True) -> tuple[StaticViews, Trajectory]:
+def constant_views(constant: int, count: int, *, moving: bool = True) -> tuple[StaticViews, Trajectory]:
     """Views of which the first have a depth of 2 m at all pixels but one."""
-    views, trajectory = make_views(of, moving=moving)
+    views, trajectory = make_views(count, moving=moving)
     changed = StaticViews(CAMERA, 2)
     for number, view in enumerate(views):
         units = torch.full((120, 160), round(2 / STORED_UNIT)).to(torch.uint16)
@@ -121,10 +121,10 @@ def constant_views(constant: int, of: int, *, moving: bool = True) -> tuple[Stat
     return changed, trajectory
 
 
-@pytest.mark.parametrize(("constant", "of"), [(2, 2), (4, 4), (3, 4)])
-def test_warning_about_constant_depth_and_nothing_else(constant: int, of: int) -> None:
+@pytest.mark.parametrize(("constant", "count"), [(2, 2), (4, 4), (3, 4)])
+def test_warning_about_constant_depth_and_nothing_else(constant: int, count: int) -> None:
     wrong = replace(TRUE, fx=2 * TRUE.fx, fy=2 * TRUE.fy, cx=2 * TRUE.cx, cy=2 * TRUE.cy)
-    (warning,) = check(*constant_views(constant, of), make_map(wrong, noise=0.3), wrong)
+    (warning,) = check(*constant_views(constant, count), make_map(wrong, noise=0.3), wrong)
     assert warning.startswith("the depth is 2 m at nearly all pixels of an image")
 
 

@@ -104,7 +104,7 @@ def test_convention_scale_error_starts_at_factor_of_one_and_a_half(size: float, 
 
 
 @pytest.mark.parametrize(("spread", "is_error"), [(0.051, True), (0.049, False)])
-def test_convention_scale_error_requires_path_of_five_centimetres(spread: float, is_error: bool) -> None:
+def test_convention_scale_error_requires_positions_that_spread_by_5_cm(spread: float, is_error: bool) -> None:
     """By the root mean square distance of the true positions from their mean."""
     truth = random_walk(40, seed=20).T_wc
     centred = truth[:, :3, 3] - truth[:, :3, 3].mean(dim=0)

@@ -37,7 +37,7 @@ def test_boxes_are_the_levels_without_their_margin() -> None:
 
 
 @pytest.mark.parametrize(
-    ("columns", "finest"), [(80, 80), (640, 640), (1000, 1000), (1280, 889), (1920, 926), (4096, 953)]
+    ("columns", "finest"), [(80, 80), (640, 640), (1000, 1000), (1280, 889), (1440, 1000), (1920, 926), (4096, 953)]
 )
 def test_finest_level_of_a_large_image_is_smaller_than_the_image(columns: int, finest: int) -> None:
     config = FeaturesConfig()

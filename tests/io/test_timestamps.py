@@ -44,8 +44,3 @@ def test_association_pairs_nearest_stamps_first(first: list[float], second: list
         if i not in expected and j not in expected.values():
             expected[i] = j
     assert associate(first, second, limit) == sorted(expected.items())
-
-
-def test_stamps_at_the_largest_difference_are_a_pair() -> None:
-    assert associate([0.0], [0.5], 0.5) == associate([0.5], [0.0], 0.5) == [(0, 0)]
-    assert associate([0.0], [0.501], 0.5) == associate([0.501], [0.0], 0.5) == []

@@ -195,7 +195,7 @@ def test_attributes_of_a_replaced_stage_are_those_of_the_stage() -> None:
 def test_stage_that_cannot_be_called_is_rejected_at_once(name: str, stage: Any) -> None:
     slam = make_slam()
     original = getattr(slam, name)
-    with pytest.raises(ConfigError, match=f"^{name} was replaced by a .*, which cannot be called; set a stage$"):
+    with pytest.raises(ConfigError, match=f"^{name} is a .*, which cannot be called; set a stage$"):
         setattr(slam, name, stage)
     assert getattr(slam, name) is original
 

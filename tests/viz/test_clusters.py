@@ -22,7 +22,7 @@ def make_cluster(rejected: int, label: str = "person 3") -> Cluster:
     return Cluster(label, points, torch.arange(200) >= rejected, points[rejected::4])
 
 
-def _legend_entries(figure: Figure) -> list[tuple[Text, Line2D]]:
+def legend_entries(figure: Figure) -> list[tuple[Text, Line2D]]:
     (legend,) = figure.legends
     return list(zip(legend.get_texts(), legend.get_lines(), strict=True))
 
@@ -47,14 +47,14 @@ def test_rejected_points_are_black(tmp_path: Path) -> None:
         save_clusters_figure([], tmp_path / "empty.png")
 
 
-def test_only_the_largest_of_many_clusters_have_a_name_and_a_colour(tmp_path: Path) -> None:
+def test_only_the_largest_of_many_clusters_have_a_name_and_a_colour() -> None:
     clusters = [make_cluster(0, f"chair {number}") for number in range(23)]
     for number in (0, 5, 22):
         small = clusters[number]
         clusters[number] = Cluster(small.label, small.before[:150], small.inliers[:150], small.after)
     figure = draw_clusters(clusters)
-    entries = {text.get_text(): handle for text, handle in _legend_entries(figure)}
+    entries = {text.get_text(): handle for text, handle in legend_entries(figure)}
     named = [f"chair {number}" for number in range(23) if number not in (0, 5, 22)]
     assert list(entries) == [*named, "rejected", "and 3 more"]
     assert len({entry.get_color() for entry in entries.values()}) == len(entries)
-    assert "more" not in " ".join(text.get_text() for text, _ in _legend_entries(draw_clusters(clusters[1:21])))
+    assert "more" not in " ".join(text.get_text() for text, _ in legend_entries(draw_clusters(clusters[1:21])))

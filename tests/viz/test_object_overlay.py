@@ -145,8 +145,10 @@ def test_labels_stay_inside_the_image_and_those_left_out_are_counted(tmp_path: P
     hidden = separate_labels(figure)
     figure.draw_without_rendering()
     shown = [patch for text in axes.texts if text.get_visible() and (patch := text.get_bbox_patch()) is not None]
-    assert len(shown) == 4 - hidden and hidden > 0 and shown
-    assert all(patch.get_window_extent().y0 >= axes.bbox.y0 - 1 for patch in shown)
+    assert len(shown) == 4 - hidden and 0 < hidden < 4
+    boxes = [patch.get_window_extent() for patch in shown]
+    assert all(axes.bbox.x0 <= box.x0 and box.x1 <= axes.bbox.x1 + 1 for box in boxes)
+    assert all(axes.bbox.y0 - 1 <= box.y0 and box.y1 <= axes.bbox.y1 + 1 for box in boxes)
     save_mask_figure([torch.zeros(3, 48, 64, dtype=torch.uint8)], [objects], tmp_path / "masks.svg")
     drawing = (tmp_path / "masks.svg").read_text()
     assert f"<!-- {4 - drawing.count('<!-- chair')} names left out -->" in drawing

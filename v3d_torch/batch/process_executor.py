@@ -82,9 +82,9 @@ class ProcessExecutor:
     def _start(self, job: Job) -> tuple[Connection, BaseProcess]:
         context = start_method()
         parent_end, child_end = context.Pipe()
-        variables = import_environment() | (ONE_THREAD_ENVIRONMENT if self.workers > 1 else {})
-        with _environment(variables), _block_interrupts():
-            arguments = job, child_end, dict(os.environ)
+        variables = ONE_THREAD_ENVIRONMENT if self.workers > 1 else {}
+        arguments = job, child_end, os.environ | variables  # programs that the job starts have their own import path
+        with _environment(import_environment() | variables), _block_interrupts():
             process = context.Process(target=_process_main, args=arguments, name=str(job))
             process.start()
         child_end.close()  # so that the pipe ends when the process ends

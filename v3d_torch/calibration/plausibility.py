@@ -65,7 +65,7 @@ _DEPTH_VIEWS = 4
 _MIN_MEASURED = 100
 """Minimum number of pixels with depth of a view whose depth can be constant; fewer can be equal by chance."""
 
-_MOST = (0.01, 0.99)
+_RANGE_QUANTILES = (0.01, 0.99)
 """Quantiles between which nearly all depth of a view lies: single pixels can be wrong."""
 
 _MIN_TURN = 0.05
@@ -127,7 +127,7 @@ def _check_constant_depth(views: StaticViews) -> list[str]:
     Only a plane has the same depth everywhere, and only from one direction.
     """
     examined = [view for view in _examined_views(views) if len(_measured(view)) >= _MIN_MEASURED]
-    ranges = [_measured(view).quantile(torch.tensor(_MOST)).tolist() for view in examined]
+    ranges = [_measured(view).quantile(torch.tensor(_RANGE_QUANTILES)).tolist() for view in examined]
     constant = [view for view, (low, high) in zip(examined, ranges, strict=True) if low == high]
     if 2 * len(constant) <= len(examined):
         return []

@@ -486,7 +486,7 @@ class Config(Section):
     """Seed of all random numbers."""
     threads: int = Field(1, gt=0, le=256)
     """Threads of torch and OpenCV: the tensors of a frame are small, and more threads mostly wait for each other. The
-    commands set them; in Python, call `torch.set_num_threads`."""
+    commands set them; in Python, call `torch.set_num_threads` and `cv2.setNumThreads`."""
     prefetch: bool = True
     """True to preprocess the next frames in threads while one is tracked, and to run the back end in a thread. The
     results are the same."""

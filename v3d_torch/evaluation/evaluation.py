@@ -15,6 +15,7 @@ from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_traj
 from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align, scale_error
 from v3d_torch.evaluation.rpe import RPE, relative_pose_error
 from v3d_torch.evaluation.statistics import Statistics
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.types import Trajectory
 
 MIN_PAIRS = 3
@@ -88,7 +89,8 @@ def evaluate(
             None if this is not known. The other poses count for the errors, but do not indicate the scale of depth.
 
     Raises:
-        InputError: If fewer than three poses can be associated, or if an argument is not a trajectory.
+        InputError: If fewer than three poses can be associated, if an argument is not a trajectory, or if
+            ``is_located`` is not a mask of the poses.
     """
     for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
         if not isinstance(value, Trajectory):
@@ -96,12 +98,15 @@ def evaluate(
                 f"the {name} is a {type(value).__name__}, not a Trajectory; read a file with read_trajectory, or build"
                 " a Trajectory from arrays"
             )
+    check_masks(is_located=is_located)
+    if is_located is not None and len(is_located) != len(estimate):
+        raise InputError(f"is_located has {len(is_located)} values for {len(estimate)} poses; give one for each pose")
     matches = associate_trajectories(groundtruth, estimate, max_time_difference)
     if len(matches) < MIN_PAIRS:
         raise InputError(
-            f"only {len(matches)} poses of the estimate {_time_range(estimate)} are within {max_time_difference:g} s of"
-            f" the ground truth {_time_range(groundtruth)}, at least {MIN_PAIRS} are needed;"
-            f" {_suggest(groundtruth, estimate)}"
+            f"only {len(matches)} of {len(estimate)} poses of the estimate {_time_range(estimate)} are within"
+            f" {max_time_difference:g} s of the ground truth {_time_range(groundtruth)}, at least"
+            f" {MIN_PAIRS} are needed; {_suggest(groundtruth, estimate)}"
         )
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
     oriented = has_orientations(groundtruth)
@@ -109,7 +114,11 @@ def evaluate(
     notes = []
     if alignment.source is RotationSource.ORIENTATIONS:
         notes.append("the ground-truth positions do not span a plane: aligned by the mean of the orientations")
-    factor = _located_scale_error(T_gc, T_ec, None if is_located is None else is_located[matches.estimate], oriented)
+    if is_located is None or bool(is_located[matches.estimate].all()):
+        factor = scale_error(T_gc, T_ec, alignment)
+    else:
+        located = is_located[matches.estimate]
+        factor = _located_scale_error(T_gc[located], T_ec[located], oriented)
     if factor is not None:
         notes.append(f"the ground truth is {factor:.3g} times as large as the estimate: check depth_scale")
     rpe = relative_pose_error(groundtruth, estimate, matches, rpe_delta) if oriented else None
@@ -180,10 +189,8 @@ def _coverage(poses: int, frames: int | None) -> float | None:
     return min(poses / frames, 1.0) if frames else None
 
 
-def _located_scale_error(T_gc: Tensor, T_ec: Tensor, is_located: Tensor | None, oriented: bool) -> float | None:
+def _located_scale_error(T_gc: Tensor, T_ec: Tensor, oriented: bool) -> float | None:
     """Compute the scale error of the poses that were measured relative to the map; None if there are too few."""
-    if is_located is not None:
-        T_gc, T_ec = T_gc[is_located], T_ec[is_located]
     if len(T_gc) < MIN_PAIRS:
         return None
     return scale_error(T_gc, T_ec, align(T_gc, T_ec, oriented=oriented))
@@ -193,7 +200,7 @@ def _suggest(groundtruth: Trajectory, estimate: Trajectory) -> str:
     """Return what to do if hardly any poses are associated."""
     advice = "check that both belong to the same sequence"
     if len(estimate) < MIN_PAIRS:
-        return f"{advice} and that the estimate is complete, it is too short with {len(estimate)} poses"
+        return f"{advice} and that the estimate is complete"
     for name, counts, seconds in (
         ("estimate", estimate.stamps, groundtruth.stamps),
         ("ground truth", groundtruth.stamps, estimate.stamps),

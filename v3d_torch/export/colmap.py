@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def write_colmap(
     """Write ``images/``, ``masks/`` and the model ``sparse/0``: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
 
     Masks have the names that COLMAP expects: the name of the image with ``.png`` appended. Image points on masked
-    pixels, which can be people, are left out, and so are landmarks that fewer than two images observe without them.
+    pixels, which can be people, are left out. A landmark that then has fewer than two image points is left out, too.
 
     Args:
         folder: Empty folder.
@@ -47,32 +48,31 @@ def write_colmap(
         OutputError: If a file cannot be written.
     """
     model = folder / "sparse" / "0"
-    uv = camera.distort(tracks.uv)
+    tracks = replace(tracks, uv=camera.distort(tracks.uv))
     colours = torch.zeros(len(tracks.points), 3, dtype=torch.uint8)
-    is_static = torch.zeros(len(uv), dtype=torch.bool)
+    is_static = torch.zeros(len(tracks.uv), dtype=torch.bool)
     image_lines, poses = [], []
     for index, image in enumerate(images):
         image.write_colour(folder / "images")
         image.write_mask(folder / "masks" / f"{image.name}.png")
         observed = torch.nonzero(tracks.image == index)[:, 0]
-        observed = observed[_values_at(image.static, uv[observed])]
+        observed = observed[_values_at(image.static, tracks.uv[observed])]
         is_static[observed] = True
-        colours[tracks.landmark[observed]] = _values_at(image.frame.image, uv[observed]).T
+        colours[tracks.landmark[observed]] = _values_at(image.frame.image, tracks.uv[observed]).T
         image_lines.append(_image_line(index, image))
         poses.append(invert(image.T_wc)[None])
     tracks = tracks.select(is_static)
-    uv = camera.distort(tracks.uv)
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then X, Y, POINT3D_ID of each point"]
     for index, line in enumerate(image_lines):
         observed = tracks.image == index
-        lines += [line, _observation_line(uv[observed], tracks.landmark[observed])]
+        lines += [line, _observation_line(tracks.uv[observed], tracks.landmark[observed])]
     write_text(model / "cameras.txt", f"# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS\n{_camera_line(camera)}\n")
     write_text(model / "images.txt", "\n".join(lines) + "\n")
     T_cw = torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
     write_text(
         model / "points3D.txt",
         "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, then IMAGE_ID, POINT2D_IDX of each observation\n"
-        + _landmark_lines(tracks, colours, _reprojection_errors(camera, tracks, uv, T_cw))
+        + _landmark_lines(tracks, colours, _reprojection_errors(camera, tracks, T_cw))
         + _point_lines(*points, first_id=len(tracks.points) + 1),
     )
 
@@ -113,11 +113,11 @@ def _values_at(image: Tensor, uv: Tensor) -> Tensor:
     return image[..., v.clamp(0, image.shape[-2] - 1), u.clamp(0, image.shape[-1] - 1)]
 
 
-def _reprojection_errors(camera: PinholeCamera, tracks: LandmarkTracks, uv: Tensor, T_cw: Tensor) -> Tensor:
+def _reprojection_errors(camera: PinholeCamera, tracks: LandmarkTracks, T_cw: Tensor) -> Tensor:
     """Return the mean distance of each landmark from its distorted image points, pixels, float64, shape (L,)."""
     T, points = T_cw[tracks.image], tracks.points[tracks.landmark]
     projected = camera.project((T[:, :3, :3] @ points[:, :, None])[..., 0] + T[:, :3, 3])
-    distances = (camera.distort(projected) - uv).norm(dim=1)
+    distances = (camera.distort(projected) - tracks.uv).norm(dim=1)
     sums, counts = torch.zeros(2, len(tracks.points), dtype=torch.float64)
     sums.index_add_(0, tracks.landmark, distances)
     counts.index_add_(0, tracks.landmark, torch.ones_like(distances))

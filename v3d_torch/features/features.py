@@ -25,8 +25,8 @@ class Features:
         uv: Undistorted pixels, float64, shape :math:`(N, 2)`.
         pixel: Nearest (column, row) in the recorded (distorted) image, int64, shape :math:`(N, 2)`.
         depth: Depth along z, metres, float64, shape :math:`(N,)`; 0 = no measurement.
-        octave: Octaves, int64, shape :math:`(N,)`. As for OpenCV's key points, it is a level of the scale pyramid,
-            whose step is ``features.scale``, not 2.
+        octave: Octaves, int64, shape :math:`(N,)`. As for OpenCV's key points, the step between octaves is
+            ``features.scale``, not 2. Octave 0 is the image; the pyramid of a large image begins at a higher one.
         descriptors: 256-bit descriptors, uint8, shape :math:`(N, 32)`.
         readout_jacobian: Derivative of ``uv`` by the readout time of a rolling shutter, pixels per second, float64,
             shape :math:`(N, 2)`; 0 if not given, as for a camera at rest.

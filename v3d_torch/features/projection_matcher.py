@@ -21,8 +21,8 @@ _MIN_COSINE = 0.5
 """Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
 
 _LEVEL_MARGIN = 1.2
-"""Number of levels beyond either end of the pyramid at which landmarks are still matched: the expected level is
-rounded, and descriptors tolerate a difference of one level."""
+"""Number of octaves beyond either end of the pyramid at which landmarks are still matched: the expected octave is
+rounded, and descriptors tolerate a difference of one octave."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class ProjectionMatcher:
         self._scale = pyramid.scale
         self._octaves = octaves_of_levels(pyramid, camera.width)
         self._camera = camera
-        # Bounds of (z, u, v, cosine, level) of a landmark in view; the lower bounds are inclusive.
+        # Bounds of (z, u, v, cosine, octave) of a landmark in view; the lower bounds are inclusive.
         margin = _LEVEL_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
         lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, self._octaves[0] - margin]
@@ -103,7 +103,7 @@ class ProjectionMatcher:
             features: Features of the frame.
             projection: Landmarks projected into the frame, see `project`.
             local_map: The local map that was projected.
-            radius: Search radius, pixels at octave 0; it grows with the level.
+            radius: Search radius, pixels at octave 0; it grows with the octave.
 
         Returns:
             Pairs (row of ``local_map``, feature), int64, shape :math:`(K, 2)`. Each landmark and each feature occurs at
@@ -127,7 +127,7 @@ class ProjectionMatcher:
         """Project a local map into a camera, and select the landmarks in view.
 
         A landmark is in view if it projects into the image, its viewing direction is similar to that of its first
-        observation, and its distance corresponds to a level of the scale pyramid.
+        observation, and its distance corresponds to an octave of the scale pyramid.
 
         Args:
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
@@ -140,10 +140,10 @@ class ProjectionMatcher:
         z = points[2]
         u, v = (self._camera.K[:2] @ points) / z
         cosine = (points * directions).sum(dim=0) / distance
-        level = torch.log(local_map.reference_distance / distance) / math.log(self._scale)
-        predicted = torch.stack([z, u, v, cosine, level])
+        octave = torch.log(local_map.reference_distance / distance) / math.log(self._scale)
+        predicted = torch.stack([z, u, v, cosine, octave])
         lower, upper = self._bounds[..., None]
         rows = torch.nonzero(((predicted >= lower) & (predicted < upper)).all(dim=0))[:, 0]
-        z, u, v, _, level = predicted.index_select(1, rows)
-        octave = level.round().clamp(self._octaves[0], self._octaves[-1]).to(torch.int64)
-        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, octave)
+        z, u, v, _, octave = predicted.index_select(1, rows)
+        nearest = octave.round().clamp(self._octaves[0], self._octaves[-1]).to(torch.int64)
+        return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, nearest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from itertools import count
 
 import cv2
 import numpy as np
@@ -22,7 +22,7 @@ def octaves_of_levels(config: FeaturesConfig, columns: int) -> range:
         config: Number of levels, and scale factor between octaves.
         columns: Number of columns of the image.
     """
-    first = max(math.ceil(math.log(columns / _MAX_COLUMNS) / math.log(config.scale)), 0)
+    first = next(octave for octave in count() if round(columns / config.scale**octave) <= _MAX_COLUMNS)
     return range(first, first + config.levels)
 
 
@@ -32,7 +32,7 @@ class ScalePyramid:
     Args:
         width: Columns of the image.
         height: Rows of the image.
-        octaves: Octaves of the levels, ascending; levels smaller than twice the margin are left out, but the first.
+        octaves: Octaves of the levels, ascending; levels smaller than twice the margin are left out, except the first.
         scale: Scale factor between octaves; octave 0 is the image.
         margin: Width of the unused border of each level, pixels.
 

@@ -39,8 +39,9 @@ def printable(value: object) -> str:
 
 
 def shorten(text: str, length: int) -> str:
-    """Leave out the middle of a text that is longer than a number of characters; names often differ at their ends."""
-    return text if len(text) <= length else f"{text[: length // 2]}…{text[-(length // 2) :]}"
+    """Leave out the middle of a text that is longer than ``length`` characters; names often differ at their ends."""
+    head = length // 2
+    return text if len(text) <= length else f"{text[:head]}…{text[len(text) - (length - 1 - head) :]}"
 
 
 def first_line(error: BaseException) -> str:

@@ -27,8 +27,8 @@ def project(
         directions: Unit viewing directions of the first observations, world frame, (L, 3).
         reference_distance: Distances at which the landmarks appear at octave 0, metres, (L,).
         K: Camera matrix, (3, 3).
-        bounds: Lower (inclusive) and upper bound of (z, u, v, cosine, level), (2, 5).
-        log_scale: Logarithm of the scale factor between pyramid levels.
+        bounds: Lower (inclusive) and upper bound of (z, u, v, cosine, octave), (2, 5).
+        log_scale: Logarithm of the scale factor between octaves.
         first_octave: Octave of the finest pyramid level.
         last_octave: Octave of the coarsest pyramid level.
 
@@ -36,7 +36,7 @@ def project(
         Indices of the landmarks in view, (V,), their pixels, (V, 2), depth, metres, (V,), and octaves, (V,).
     """
     lower, upper = bounds
-    rows, level_of = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    rows, octaves = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     uv, depth, count = np.empty((len(points), 2)), np.empty(len(points)), 0
     for i in range(len(points)):
         x, y, z = transform(T_cw, points[i, 0], points[i, 1], points[i, 2])
@@ -49,9 +49,9 @@ def project(
             rotated = T_cw[k, 0] * directions[i, 0] + T_cw[k, 1] * directions[i, 1] + T_cw[k, 2] * directions[i, 2]
             cosine += coordinate * rotated
         cosine /= distance
-        level = math.log(reference_distance[i] / distance) / log_scale
-        if lower[3] <= cosine < upper[3] and lower[4] <= level < upper[4]:
+        octave = math.log(reference_distance[i] / distance) / log_scale
+        if lower[3] <= cosine < upper[3] and lower[4] <= octave < upper[4]:
             rows[count], uv[count, 0], uv[count, 1], depth[count] = i, u, v, z
-            level_of[count] = min(max(int(np.rint(level)), first_octave), last_octave)
+            octaves[count] = min(max(int(np.rint(octave)), first_octave), last_octave)
             count += 1
-    return rows[:count], uv[:count], depth[:count], level_of[:count]
+    return rows[:count], uv[:count], depth[:count], octaves[:count]

@@ -98,7 +98,7 @@ class MotionEstimator:
     def __init__(self, config: OdometryConfig, features: FeaturesConfig, camera: PinholeCamera, seed: int) -> None:
         self._config = config
         self._cell = features.cell
-        self._pixel = features.scale ** octaves_of_levels(features, camera.width)[0]  # of the finest level
+        self._finest_pixel = features.scale ** octaves_of_levels(features, camera.width)[0]
         self._camera = camera
         self._seed = seed
 
@@ -131,7 +131,7 @@ class MotionEstimator:
         epipolar = epipolar_inliers(
             a.uv[pairs[:, 0]],
             b.uv[pairs[:, 1]],
-            threshold=_EPIPOLAR_THRESHOLD * self._pixel,
+            threshold=_EPIPOLAR_THRESHOLD * self._finest_pixel,
             iterations=config.iterations,
             seed=self._seed,
         )
@@ -143,7 +143,7 @@ class MotionEstimator:
             b.uv[pairs[:, 1]],
             self._camera.K,
             initial_guess,
-            threshold=_PNP_THRESHOLD * self._pixel,
+            threshold=_PNP_THRESHOLD * self._finest_pixel,
             iterations=config.iterations,
             seed=self._seed,
         )

@@ -132,8 +132,9 @@ class Pipeline:
             record.failure = str(error)
         except Exception as error:  # keep the results so far after an error of the program
             _LOG.exception("the run failed")
-            reason = first_line(error)
-            record.failure = f"the program failed with {type(error).__name__}: {reason}; report it with the run.log"
+            kind, reason = type(error).__name__, first_line(error)
+            cause = kind if reason == kind else f"{kind}: {reason}"
+            record.failure = f"the program failed with {cause}; report it with the run.log"
         except KeyboardInterrupt:
             record.interrupted = True
             if isinstance(self.sequence, Sized):

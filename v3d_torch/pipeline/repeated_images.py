@@ -16,24 +16,32 @@ _MIN_FRACTION = 0.05
 _MIN_FRAMES = 10
 """Minimum number of images for a warning that all are equal: also a short test can repeat one image."""
 
+_MIN_STUCK = 9
+"""Minimum number of copies in a row of a stream that is stuck; a camera that is slower than its stream has fewer."""
+
 
 @dataclass
 class RepeatedImages:
-    """Counts images that equal the one before, without uniform images: all images in the dark are equal.
+    """Counts images that equal the one before. Uniform images are not counted: images in the dark are all equal.
 
     Attributes:
         count: Number of such images so far.
+        longest: Largest number of them in a row.
+        in_a_row: Number of the newest ones in a row.
         newest: Newest image, shape :math:`(C, H, W)`; None before the first one.
     """
 
     count: int = 0
+    longest: int = 0
+    in_a_row: int = 0
     newest: Tensor | None = None
 
     def add(self, image: Tensor) -> None:
         """Compare a colour or depth image with the one before, shape :math:`(C, H, W)`."""
-        if self.newest is not None and self.newest.shape == image.shape:
-            sampled = (each[:, ::_STRIDE, ::_STRIDE] for each in (self.newest, image))
-            self.count += torch.equal(*sampled) and torch.equal(self.newest, image) and not _is_uniform(image)
+        is_repeated = self.newest is not None and _are_equal(self.newest, image) and not _is_uniform(image)
+        self.count += is_repeated
+        self.in_a_row = self.in_a_row + 1 if is_repeated else 0
+        self.longest = max(self.longest, self.in_a_row)
         self.newest = image
 
     def check(self, frames: int, images: str = "images") -> list[str]:
@@ -45,17 +53,22 @@ class RepeatedImages:
         """
         if self.count <= _MIN_FRACTION * frames:
             return []
-        if self.count == frames - 1:
-            if frames < _MIN_FRAMES:
-                return []
+        if frames < _MIN_FRAMES and self.count == frames - 1:
+            return []
+        if 2 * self.longest > self.count and self.longest >= _MIN_STUCK:
             return [
-                f"all {frames} {images} are equal: the stream seems to be stuck, because images of a camera have noise;"
-                " record or export them again"
+                f"{self.longest + 1} of {frames} {images} in a row are equal: the stream seems to be stuck, because"
+                " images of a camera have noise; record or export them again"
             ]
         return [
             f"{self.count} of {frames} {images} are equal to the one before: the stream seems to stop and jump, which"
             " makes velocities, readout and path less accurate; leave out the copies"
         ]
+
+
+def _are_equal(a: Tensor, b: Tensor) -> bool:
+    """Compare images, shape (C, H, W): first a part of the pixels."""
+    return torch.equal(a[:, ::_STRIDE, ::_STRIDE], b[:, ::_STRIDE, ::_STRIDE]) and torch.equal(a, b)
 
 
 def _is_uniform(image: Tensor) -> bool:

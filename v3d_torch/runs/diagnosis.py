@@ -27,9 +27,6 @@ _MAX_EMPTY_FRACTION = 0.01
 _MIN_IMAGE_SIZE = 96
 """Minimum number of rows and of columns of an image in which enough features are found in most scenes."""
 
-_OTHER_MAP = "pass a map of the same place, or run without --load-map"
-"""Fix of a run whose frames are not localised in a known map."""
-
 
 def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | None) -> str | None:
     """Explain incomplete results of a run that ended without an error.
@@ -48,30 +45,34 @@ def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | N
     if pipeline.slam.poses.is_localised:
         return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
     if request.load_map is not None:
-        return f"{request.load_map}: no frame of {request.seq} was localised in this map; {_OTHER_MAP}"
-    cause = _cause_of_loss(pipeline, request, pipeline.record.times.indices)
+        return (
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
+            " run without --load-map"
+        )
+    cause = _cause_of_loss(pipeline, pipeline.record.times.indices)
     return f"{name}: the camera was not found in any of the {count} frames, {cause}"
 
 
-def check_lost_frames(pipeline: Pipeline, request: RunRequest) -> list[str]:
+def check_lost_frames(pipeline: Pipeline) -> list[str]:
     """Check whether a run that reached the end of its sequence lost more than half of the frames, but not all.
 
     Args:
         pipeline: Pipeline that has run.
-        request: Inputs of the run.
 
     Returns:
         A sentence with cause and fix, or nothing.
     """
-    statuses = pipeline.slam.poses.statuses
+    indices = pipeline.record.times.indices
+    statuses = pipeline.slam.poses.statuses[: len(indices)]  # there is one more if a frame was interrupted
     lost = torch.tensor([status is TrackingStatus.LOST for status in statuses], dtype=torch.bool)
     if not len(statuses) / 2 < int(lost.sum()) < len(statuses):
         return []
-    cause = _cause_of_loss(pipeline, request, pipeline.record.times.indices[lost])
+    cause = _cause_of_loss(pipeline, indices[lost])
     return [f"{int(lost.sum())} of {len(statuses)} frames are lost: {cause}"]
 
 
-def _cause_of_loss(pipeline: Pipeline, request: RunRequest, indices: Tensor) -> str:
+@torch.inference_mode()  # stages are called, in the mode in which they ran
+def _cause_of_loss(pipeline: Pipeline, indices: Tensor) -> str:
     """Return cause and fix of the loss of frames, given by their indices in the sequence, int64, (N,)."""
     sequence, max_depth = pipeline.sequence, pipeline.slam.config.features.max_depth
     if isinstance(sequence, RGBDSequence):
@@ -95,8 +96,6 @@ def _cause_of_loss(pipeline: Pipeline, request: RunRequest, indices: Tensor) -> 
                 f"nearly all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise"
                 " features.max_depth"
             )
-    if request.load_map is not None:
-        return f"they were not localised in {request.load_map}; {_OTHER_MAP}"
     if min(sequence.camera.width, sequence.camera.height) < _MIN_IMAGE_SIZE:
         return (
             f"images of {sequence.camera.width}x{sequence.camera.height} pixels have too few features; use images of at"
@@ -109,7 +108,8 @@ def _cause_of_loss(pipeline: Pipeline, request: RunRequest, indices: Tensor) -> 
                 f"at most {most} features of an image have depth, and a map starts with mapping.min_tracked={needed};"
                 " lower it, raise features.count, or record it again with more texture in view"
             )
-    if bool(torch.isin(pipeline.record.dynamics["frame"], indices).any()):
+    has_objects = torch.isin(indices, pipeline.record.dynamics["frame"])
+    if 2 * int(has_objects.sum()) > len(indices):
         return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 

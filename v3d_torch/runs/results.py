@@ -31,7 +31,7 @@ from v3d_torch.occupancy.octomap_file import write_octomap
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
-from v3d_torch.runs.diagnosis import diagnose
+from v3d_torch.runs.diagnosis import check_lost_frames, diagnose
 from v3d_torch.runs.file_names import FIGURES, RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_tables import ResultTables, collect_tables
@@ -73,10 +73,12 @@ def write_results(folder: Path, pipeline: Pipeline, request: RunRequest | None =
     _write_tables(folder, tables, metrics)
     point_map = pipeline.fuse_points()
     if request is not None and record.failure is None:
+        pipeline.warn(check_lost_frames(pipeline))
         record.diagnosis = diagnose(pipeline, request, tables.evaluation)
     _write_maps(folder, pipeline, tables.trajectory, point_map)
     draw_run(folder / FIGURES, pipeline, tables.trajectory, point_map)
-    metrics |= {"failure": record.failure, "diagnosis": record.diagnosis, "peak_memory_mb": _peak_memory_mb()}
+    metrics |= {"failure": record.failure, "diagnosis": record.diagnosis, "warnings": record.warnings}
+    metrics["peak_memory_mb"] = _peak_memory_mb()
     _write_metrics(folder, metrics)
     return tables.evaluation
 

@@ -24,7 +24,6 @@ from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.pipeline import FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
-from v3d_torch.runs.diagnosis import check_lost_frames
 from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
 from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
@@ -135,8 +134,6 @@ class Run:
 
         try:
             self.pipeline.flush()
-            if is_whole:
-                self.pipeline.warn(check_lost_frames(self.pipeline, self._request))
             slam = self.pipeline.slam
             _LOG.info("readout: %s", describe_readout(slam.map.readout, slam.config.rolling_shutter))
             if self._map_file is not None:

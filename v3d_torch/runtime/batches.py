@@ -68,7 +68,7 @@ def check_finite_arguments(**values: Tensor) -> None:
     """
     for name, each in values.items():
         if can_read(each) and not bool(each.isfinite().all()):
-            raise InputError(f"{name} has a value that is not finite; give finite numbers, also in the padding")
+            raise InputError(f"{name} has a value that is not finite; give finite numbers")
 
 
 def common_batch(*batches: torch.Size) -> torch.Size:

@@ -13,8 +13,8 @@ from functools import cache
 def import_environment() -> dict[str, str]:
     """Return the environment variables with which a new interpreter imports from the same folders as this process.
 
-    By default, one that is started with ``-c`` or ``-m`` imports from the current folder first, where a file
-    ``html.py`` can be.
+    Without them, an interpreter that is started with ``-c`` or ``-m`` imports from the current folder first: a file
+    ``html.py`` in it would replace the module of Python.
     """
     return {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "PYTHONSAFEPATH": "1"}
 

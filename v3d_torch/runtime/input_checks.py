@@ -74,7 +74,9 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
         if wrong is None and not abs(float(gravity.norm()) - 1) < _MAX_NORM_ERROR:
             wrong = str(gravity.tolist())
         if wrong is not None:
-            raise InputError(f"frame {frame.index}: the gravity is {wrong}; give a unit vector in the camera frame")
+            raise InputError(
+                f"frame {frame.index}: the gravity is {wrong}; give a unit vector in the camera frame, in float64"
+            )
     if frame.camera is not None and frame.camera != camera:
         raise InputError(
             f"frame {frame.index}: its camera differs from that of the V3DSLAM; make one V3DSLAM for each camera"

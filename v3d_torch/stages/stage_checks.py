@@ -119,7 +119,7 @@ class ReplaceableStages:
         """Set an attribute.
 
         Raises:
-            ConfigError: If a callable stage is replaced by a value that is not callable, or if the attribute is used
+            ConfigError: If a stage is set to a value that is not callable, or if the attribute is used
                 inside another stage only, so that its replacement would have no effect.
         """
         if name in _INNER_STAGES and name in vars(self):
@@ -127,7 +127,7 @@ class ReplaceableStages:
                 f"{name} cannot be replaced, because it is used inside {_INNER_STAGES[name]}; replace that instead"
             )
         if name in STAGES and not callable(value):
-            raise ConfigError(f"{name} was replaced by {describe_type(value)}, which cannot be called; set a stage")
+            raise ConfigError(f"{name} is {describe_type(value)}, which cannot be called; set a stage")
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
         is_hooked = isinstance(vars(self).get(name), HookedStage)

@@ -14,7 +14,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
 
 _SEARCH_RADIUS = 10.0
-"""Search radius around the projection of a landmark, pixels at octave 0; it grows with the level. The error of a
+"""Search radius around the projection of a landmark, pixels at octave 0; it grows with the octave. The error of a
 predicted pose is some pixels."""
 
 _REFINED_SEARCH_RATIO = 0.5

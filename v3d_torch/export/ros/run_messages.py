@@ -98,7 +98,7 @@ class RunMessages:
             yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)
 
     def of_end(self, slam: V3DSLAM, point_map: PointMap) -> Iterator[TopicMessage]:
-        """Yield the messages of the final state, with the timestamp of the last frame; none if all frames were lost.
+        """Yield the messages of the final state at the time of the last frame; none if the camera was never found.
 
         If up has become known or more accurate since that frame, ``map`` is turned a microsecond later.
 
@@ -106,12 +106,13 @@ class RunMessages:
             slam: System after at least one frame.
             point_map: Map of the static scene.
         """
-        if self._previous is None:
+        if not slam.poses.is_localised:
             return
         stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), frames.map_frame(slam.T_lw)
         if not torch.equal(T_mw, self._T_mw):
             stamp, self._T_mw = stamp + _TURN_DELAY, T_mw
-            T_ml = frames.camera_in_map(invert(slam.poses.poses_of([self._previous])[0]), T_mw)
+            newest = len(slam.poses) - 1 if self._previous is None else self._previous
+            T_ml = frames.camera_in_map(invert(slam.poses.poses_of([newest])[0]), T_mw)
             self._odometry_frame.update(T_ml, T_ml)
             yield "/tf", self._tree(stamp, is_lost=slam.poses.status is TrackingStatus.LOST)
         yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw))
