@@ -289,7 +289,7 @@ def test_missing_results_and_unusable_ground_truth_are_one_line_each(copy: Path,
     for arguments, words in (
         ([tmp_path / "nowhere"], "nowhere: has no results of a run"),
         ([tmp_path / (300 * "x")], "cannot be used (File name too long); check path and permissions"),
-        ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 poses"),
+        ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 of 14 poses"),
     ):
         done = call_here(*arguments)
         assert done.exit_code == 2 and done.stdout == ""
