@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from threading import Event
@@ -86,3 +88,14 @@ def test_job_imports_nothing_from_the_current_folder(
     *_, end = ProcessExecutor(1)(planned, Event())
     assert not (tmp_path / "imported").exists()
     assert isinstance(end, JobFinished) and end.failure is None
+
+
+def test_command_imports_nothing_from_the_current_folder(moment: Path, tmp_path: Path) -> None:
+    """Also the server whose forks run the jobs is a new interpreter."""
+    (tmp_path / "socket.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n")
+    command = [Path(sys.executable).with_name("v3d-torch"), "batch", "--seqs", moment, "--configs", "baseline"]
+    ended = subprocess.run(  # noqa: S603
+        [*command, "--out", "out"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert not (tmp_path / "imported").exists()
