@@ -20,7 +20,6 @@ _MAX_SCREEN_NAME = 40
 """Maximum number of characters of a name on the screen, so that one long name does not widen all rows; the middle of a
 longer one is left out."""
 
-
 _MAX_ROWS_OF_A_PAGE = 40
 """Number of rows above which a LaTeX table breaks across pages."""
 

@@ -20,7 +20,7 @@ from v3d_torch.optim.reprojection import MIN_DEPTH
 _MIN_COSINE = 0.5
 """Cosine of the maximum change of viewing direction, 60 degrees; descriptors differ beyond it (ORB-SLAM2)."""
 
-_LEVEL_MARGIN = 1.2
+_OCTAVE_MARGIN = 1.2
 """Number of octaves beyond either end of the pyramid at which landmarks are still matched: the expected octave is
 rounded, and descriptors tolerate a difference of one octave."""
 
@@ -88,7 +88,7 @@ class ProjectionMatcher:
         self._octaves = octaves_of_levels(pyramid, camera.width)
         self._camera = camera
         # Bounds of (z, u, v, cosine, octave) of a landmark in view; the lower bounds are inclusive.
-        margin = _LEVEL_MARGIN
+        margin = _OCTAVE_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
         lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, self._octaves[0] - margin]
         upper = [math.inf, u_max, v_max, math.inf, self._octaves[-1] + margin]

@@ -16,7 +16,7 @@ and eight levels would not reach features that are coarse enough for a camera th
 
 
 def octaves_of_levels(config: FeaturesConfig, columns: int) -> range:
-    """Return the octaves of a pyramid's levels; in a large image from the first with at most 1000 columns on.
+    """Return the octaves of a pyramid's levels; in a large image, the first is the finest with at most 1000 columns.
 
     Args:
         config: Number of levels, and scale factor between octaves.
@@ -57,7 +57,7 @@ class ScalePyramid:
         """Return the image of all levels of a grey image, uint8."""
         canvas = np.empty(self._shape, np.uint8)
         level = canvas[: self.sizes[0][1]]
-        level[:] = cv2.resize(grey, self.sizes[0], interpolation=cv2.INTER_AREA)
+        cv2.resize(grey, self.sizes[0], dst=level, interpolation=cv2.INTER_AREA)
         for top, (width, height) in zip(self.tops[1:].tolist(), self.sizes[1:], strict=True):
             level = np.asarray(cv2.resize(level, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
             rows = canvas[top : top + height]

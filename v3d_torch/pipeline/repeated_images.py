@@ -13,11 +13,9 @@ _STRIDE = 16
 _MIN_FRACTION = 0.05
 """Fraction of repeated images above which they are warned of: a few do not change the path."""
 
-_MIN_FRAMES = 10
-"""Minimum number of images for a warning that all are equal: also a short test can repeat one image."""
-
 _MIN_STUCK = 9
-"""Minimum number of copies in a row of a stream that is stuck; a camera that is slower than its stream has fewer."""
+"""Minimum number of copies in a row of a stream that is stuck. A camera that is slower than its stream has fewer, and a
+short test can repeat one image."""
 
 
 @dataclass
@@ -53,13 +51,13 @@ class RepeatedImages:
         """
         if self.count <= _MIN_FRACTION * frames:
             return []
-        if frames < _MIN_FRAMES and self.count == frames - 1:
-            return []
         if 2 * self.longest > self.count and self.longest >= _MIN_STUCK:
             return [
                 f"{self.longest + 1} of {frames} {images} in a row are equal: the stream seems to be stuck, because"
                 " images of a camera have noise; record or export them again"
             ]
+        if self.count == frames - 1:
+            return []
         return [
             f"{self.count} of {frames} {images} are equal to the one before: the stream seems to stop and jump, which"
             " makes velocities, readout and path less accurate; leave out the copies"
