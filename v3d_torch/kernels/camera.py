@@ -39,6 +39,15 @@ def distort(x: float, y: float, intrinsics: Intrinsics) -> tuple[float, float]:
 
 
 @device
+def is_in_image(a: float, b: float, z: float, u: float, v: float, min_depth: float, bounds: Bounds) -> bool:
+    """Check whether a point (a, b) = (x / z, y / z) at depth z, with the distorted pixel (u, v), lies in the image."""
+    x_min, x_max, y_min, y_max, width, height = bounds
+    # Operators without branches, so that a loop over many points becomes a loop over vectors.
+    in_view = (z > min_depth) & (x_min <= a) & (a <= x_max) & (y_min <= b) & (b <= y_max)
+    return in_view & (-0.5 <= u) & (u < width - 0.5) & (-0.5 <= v) & (v < height - 0.5)
+
+
+@device
 def project_to_image(
     x: float, y: float, z: float, min_depth: float, intrinsics: Intrinsics, bounds: Bounds
 ) -> tuple[bool, float, float]:
@@ -46,10 +55,6 @@ def project_to_image(
 
     The pixel of a point outside the image is NaN.
     """
-    x_min, x_max, y_min, y_max, width, height = bounds
     a, b = x / z, y / z
-    if z > min_depth and x_min <= a <= x_max and y_min <= b <= y_max:
-        u, v = distort(a, b, intrinsics)
-        if -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
-            return True, u, v
-    return False, math.nan, math.nan
+    u, v = distort(a, b, intrinsics)
+    return (True, u, v) if is_in_image(a, b, z, u, v, min_depth, bounds) else (False, math.nan, math.nan)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from v3d_torch.kernels.camera import Bounds, Intrinsics, project_to_image
+from v3d_torch.kernels.camera import Bounds, Intrinsics, distort, is_in_image
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.reprojection import Array, transform
 
@@ -18,21 +18,28 @@ Limits = tuple[float, float, float, float]
 
 
 @device
-def _is_free(
-    x: float, y: float, z: float, T_cw: Array, nearest_depth: Depth, intrinsics: Intrinsics, bounds: Bounds,
-    limits: Limits,
-) -> float:  # fmt: skip
-    """Return 1 if a point (world frame) lies in free space, 0 if it lies on a surface, NaN if this is unknown."""
+def _to_pixels(points: Array, intrinsics: Intrinsics, pixels: Array) -> None:
+    for i in range(points.shape[1]):
+        pixels[0, i], pixels[1, i] = distort(points[0, i], points[1, i], intrinsics)
+
+
+@device
+def _compare(
+    points: Array, nearest_depth: Depth, intrinsics: Intrinsics, bounds: Bounds, limits: Limits, free: Array
+) -> None:
+    """Compare points (x / z, y / z, z), (3, N), with a view: 1 in free space, 0 on a surface, NaN if unknown, (N,)."""
     min_depth, _, relative_tolerance, min_tolerance = limits
-    x, y, z = transform(T_cw, x, y, z)
-    inside, u, v = project_to_image(x, y, z, min_depth, intrinsics, bounds)
-    if not inside:
-        return math.nan
-    measured = nearest_depth[int(np.rint(v)), int(np.rint(u))]
-    tolerance = max(relative_tolerance * (z * z), min_tolerance)
-    if not (measured > 0 and measured > z - tolerance):
-        return math.nan
-    return 1.0 if measured > z + tolerance else 0.0
+    pixels = np.empty((2, free.size))
+    _to_pixels(points, intrinsics, pixels)  # a loop of its own is vectorised
+    for i in range(free.size):
+        a, b, z = points[0, i], points[1, i], points[2, i]
+        u, v = pixels[0, i], pixels[1, i]
+        free[i] = math.nan
+        if is_in_image(a, b, z, u, v, min_depth, bounds):
+            measured = nearest_depth[int(np.rint(v)), int(np.rint(u))]
+            tolerance = max(relative_tolerance * (z * z), min_tolerance)
+            if measured > 0 and measured > z - tolerance:
+                free[i] = 1.0 if measured > z + tolerance else 0.0
 
 
 @kernel("(f8[:,:], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4))")
@@ -52,11 +59,26 @@ def is_free_space(
     Returns:
         1 for free space, 0 for a surface, NaN if unknown, (P,).
     """
-    free = np.empty(len(points))
+    free, in_view = np.empty(len(points)), np.empty((3, len(points)))
     for i in range(len(points)):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        free[i] = _is_free(x, y, z, T_cw, nearest_depth, intrinsics, bounds, limits)
+        x, y, z = transform(T_cw, points[i, 0], points[i, 1], points[i, 2])
+        in_view[0, i], in_view[1, i], in_view[2, i] = x / z, y / z, z
+    _compare(in_view, nearest_depth, intrinsics, bounds, limits, free)
     return free
+
+
+@device
+def _transform_row(
+    depth: Depth, stride: int, rays: Array, T_wc: Array, T_cw: Array, limits: Limits, in_view: Array
+) -> None:
+    """Transform every n-th point of a row from one view to another, (x / z, y / z, z); z is NaN without depth."""
+    min_depth, max_depth, _, _ = limits
+    for i in range(in_view.shape[1]):
+        d = float(depth[i * stride])
+        x, y, z = transform(T_wc, rays[0, i] * d, rays[1, i] * d, rays[2, i] * d)
+        x, y, z = transform(T_cw, x, y, z)
+        in_view[0, i], in_view[1, i] = x / z, y / z
+        in_view[2, i] = z if (min_depth < d) & (d <= max_depth) else math.nan
 
 
 @kernel(
@@ -81,12 +103,9 @@ def newly_occupied(
         limits: Range of depths and tolerances.
         appeared: 1 for free space, 0 for a surface, NaN if unknown, (h, w); written.
     """
-    min_depth, max_depth, _, _ = limits
     height, width = appeared.shape
+    in_view = np.empty((3, width))
     for row in range(height):
-        for column in range(width):
-            d, i = float(depth[row * stride, column * stride]), row * width + column
-            appeared[row, column] = math.nan
-            if min_depth < d <= max_depth:
-                x, y, z = transform(T_wc, rays[0, i] * d, rays[1, i] * d, rays[2, i] * d)
-                appeared[row, column] = _is_free(x, y, z, T_cw, nearest_depth, intrinsics, bounds, limits)
+        row_rays = rays[:, row * width : (row + 1) * width]
+        _transform_row(depth[row * stride], stride, row_rays, T_wc, T_cw, limits, in_view)
+        _compare(in_view, nearest_depth, intrinsics, bounds, limits, appeared[row])
