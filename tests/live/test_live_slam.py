@@ -65,9 +65,35 @@ def test_each_result_has_state_and_times() -> None:
         assert result.status is TrackingStatus.TRACKED
         assert start < result.captured_at < result.finished_at < time.monotonic()
         assert result.latency == result.finished_at - result.captured_at
+        assert result.pose_latency == result.located_at - result.captured_at
         assert torch.linalg.eigvalsh(result.covariance).min() >= 0
         assert result.twist.shape == (6,)
     assert live.pose_at(results[3].stamp).T_wc.allclose(results[3].T_wc, atol=1e-3)
+
+
+def test_pose_is_known_before_the_network_has_found_the_objects() -> None:
+    source, send = feed()
+    step = float(Wall().groundtruth.T_wc[1, 0, 3])
+    is_known: list[bool] = []
+
+    def segment(frame: RGBDFrame) -> Instances:
+        deadline = time.monotonic() + 10
+        while frame.index == 1 and not is_known and time.monotonic() < deadline:
+            if float(live.pose_at(frame.stamp).T_wc[0, 3]) == pytest.approx(step, rel=0.1):
+                is_known.append(True)
+            time.sleep(0.01)
+        return square(frame)
+
+    live = LiveSLAM(source, V3DSLAM(CAMERA, segment))
+    results = []
+    for result in live:
+        results.append(result)
+        send()
+    assert is_known == [True]
+    first, *others = results
+    assert first.pose_latency == first.latency  # without a frame before, no motion is measured
+    for result in others:
+        assert 0 < result.pose_latency < result.latency
 
 
 def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -> None:

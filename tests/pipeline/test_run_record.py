@@ -38,10 +38,12 @@ def test_values_of_an_object_without_a_centroid_are_nan() -> None:
         assert table[column].isnan().all(), column
 
 
-def test_latency_statistics_are_those_of_numpy() -> None:
+@pytest.mark.parametrize("name", ["pose_latency", "latency"])
+def test_statistics_of_latencies_are_those_of_numpy(name: str) -> None:
     table = LiveTable()
-    assert table.latency_statistics() is None
-    latency = torch.rand(101, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    table.append(latency=latency, dropped=torch.zeros(101, dtype=torch.int64))
-    expected = {"median": np.median(latency), "p95": np.percentile(latency, 95), "max": np.max(latency.numpy())}
-    assert table.latency_statistics() == pytest.approx(expected)
+    assert table.statistics(name) is None
+    pose_latency, latency = torch.rand(2, 101, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    table.append(pose_latency=pose_latency, latency=latency, dropped=torch.zeros(101, dtype=torch.int64))
+    values = table[name].numpy()
+    expected = {"median": np.median(values), "p95": np.percentile(values, 95), "max": values.max()}
+    assert table.statistics(name) == pytest.approx(expected)

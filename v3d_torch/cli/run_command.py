@@ -289,9 +289,10 @@ def _summary_table(
     table.add_row("objects", str(record.dynamics.count_objects()))
     if motion_states:
         table.add_row("frames of objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()))
-    if (latency := record.live.latency_statistics()) is not None:
-        text = f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms"
-        table.add_row("latency", text)
+    for title, name in (("latency of poses", "pose_latency"), ("latency of results", "latency")):
+        if (latency := record.live.statistics(name)) is not None:
+            table.add_row(title, f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms")
+    if len(record.live):
         rejected = f", {record.rejected} late or out of order" if record.rejected else ""
         table.add_row("dropped", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
     table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")

@@ -43,8 +43,8 @@ def is_in_image(a: float, b: float, z: float, u: float, v: float, min_depth: flo
     """Check whether a point (a, b) = (x / z, y / z) at depth z, with the distorted pixel (u, v), lies in the image."""
     x_min, x_max, y_min, y_max, width, height = bounds
     # Operators without branches, so that a loop over many points becomes a loop over vectors.
-    in_view = (z > min_depth) & (x_min <= a) & (a <= x_max) & (y_min <= b) & (b <= y_max)
-    return in_view & (-0.5 <= u) & (u < width - 0.5) & (-0.5 <= v) & (v < height - 0.5)
+    in_view = (z > min_depth) & (a >= x_min) & (a <= x_max) & (b >= y_min) & (b <= y_max)
+    return in_view & (u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)
 
 
 @device

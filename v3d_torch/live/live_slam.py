@@ -13,6 +13,7 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.live.frame_capture import FrameCapture
 from v3d_torch.live.live_preprocessor import LivePreprocessor
 from v3d_torch.objects.assignment import match_instances
+from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
 from v3d_torch.runtime.process import trim_memory_at_intervals
 from v3d_torch.slam import V3DSLAM
@@ -28,12 +29,16 @@ class LiveResult(FrameResult):
         frame: Frame to which the result belongs.
         captured_at: Time of capture in the clock of the computer (`time.monotonic`), seconds; ``stamp`` is the time in
             the clock of the camera.
+        located_at: Time in the clock of the computer, seconds, at which the motion since the previous frame was
+            measured, from which `pose_at` computes the pose of this frame before its objects are known; the time of
+            this result if the motion was not measured.
         finished_at: Time of this result in the clock of the computer, seconds.
         dropped: Number of frames that were dropped since the previous result.
     """
 
     frame: RGBDFrame
     captured_at: float
+    located_at: float
     finished_at: float
     dropped: int
 
@@ -41,6 +46,11 @@ class LiveResult(FrameResult):
     def latency(self) -> float:
         """Time from the capture of the frame to its result, seconds."""
         return self.finished_at - self.captured_at
+
+    @property
+    def pose_latency(self) -> float:
+        """Time from the capture of the frame to its first pose, seconds."""
+        return self.located_at - self.captured_at
 
 
 class LiveSLAM:
@@ -71,6 +81,7 @@ class LiveSLAM:
         self._source = source
         self._clock = clock
         self._capture: FrameCapture | None = None
+        self._measured_at: float | None = None  # time at which the motion to the newest frame was measured
 
     @property
     def rejected(self) -> int:
@@ -87,7 +98,8 @@ class LiveSLAM:
         _warm_up(self.slam)
         self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
         preprocessor = LivePreprocessor(capture.frames, self.slam)
-        with closing(preprocessor), closing(capture):
+        hook = self.slam.register_stage_hook("odometry", self._record_motion)
+        with closing(preprocessor), closing(capture), hook:
             capture.start()
             preprocessor.start()
             number = 0
@@ -96,12 +108,14 @@ class LiveSLAM:
                 result = self.slam.track(live.preprocessed)
                 preprocessor.end_tracking()
                 finished_at, captured = self._clock.now(), live.captured
+                located_at = finished_at if self._measured_at is None else self._measured_at
                 dropped, number = captured.number - number - 1, captured.number
                 self.dropped += dropped
                 yield LiveResult(
                     **vars(result),
                     frame=captured.frame,
                     captured_at=captured.captured_at,
+                    located_at=located_at,
                     finished_at=finished_at,
                     dropped=dropped,
                 )
@@ -124,6 +138,9 @@ class LiveSLAM:
     def pose_at(self, stamp: float) -> CameraState:
         """Return the state of the camera at a time, see `V3DSLAM.pose_at`; can be called from any thread."""
         return self.slam.pose_at(stamp)
+
+    def _record_motion(self, name: str, arguments: tuple[object, ...], motion: CameraMotion) -> None:
+        self._measured_at = self._clock.now() if motion.is_measured else None
 
 
 def _warm_up(slam: V3DSLAM) -> None:

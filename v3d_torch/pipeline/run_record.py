@@ -187,10 +187,10 @@ class StateTable(TensorTable):
 
 
 class LiveTable(TensorTable):
-    """Latency of each frame of a live run, seconds, and number of frames that were dropped before it."""
+    """Latencies of the pose and of the result of each live frame, seconds, and number of frames dropped before it."""
 
     def __init__(self) -> None:
-        super().__init__(latency=((), torch.float64), dropped=((), torch.int64))
+        super().__init__(pose_latency=((), torch.float64), latency=((), torch.float64), dropped=((), torch.int64))
 
     @property
     def dropped(self) -> int:
@@ -199,14 +199,18 @@ class LiveTable(TensorTable):
 
     def append_result(self, result: LiveResult) -> None:
         """Append a live frame."""
-        latency = torch.tensor([result.latency], dtype=torch.float64)
-        self.append(latency=latency, dropped=torch.tensor([result.dropped]))
+        pose_latency, latency = torch.tensor([[result.pose_latency], [result.latency]], dtype=torch.float64)
+        self.append(pose_latency=pose_latency, latency=latency, dropped=torch.tensor([result.dropped]))
 
-    def latency_statistics(self) -> dict[str, float] | None:
-        """Return median, 95th percentile and maximum of the latency, seconds; None without frames."""
+    def statistics(self, name: str) -> dict[str, float] | None:
+        """Return median, 95th percentile and maximum of a latency, seconds; None without frames.
+
+        Args:
+            name: ``pose_latency`` or ``latency``.
+        """
         if not len(self):
             return None
-        latency = self["latency"]
+        latency = self[name]
         median, p95 = latency.quantile(torch.tensor([0.5, 0.95], dtype=torch.float64)).tolist()
         return {"median": median, "p95": p95, "max": float(latency.max())}
 
@@ -218,7 +222,7 @@ class RunRecord:
     Attributes:
         times: Time spent on each frame.
         states: State of the camera at each frame.
-        live: Latency of each frame of a live run; empty for a stored sequence.
+        live: Latencies of each frame of a live run; empty for a stored sequence.
         rejected: Number of live frames that were late, duplicate or out of order.
         dynamics: Objects of all frames.
         snapshots: Frames for the figure of masks.
