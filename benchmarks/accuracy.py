@@ -41,6 +41,8 @@ CONFIGURATIONS = {
     "baseline": ["--segmenter", "none"],
     "global_shutter": ["--config", "global_shutter"],
     "paper": ["--config", "paper"],
+    "realtime": ["--config", "realtime"],
+    "live": ["--config", "realtime", "--realtime"],
 }
 
 

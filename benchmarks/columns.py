@@ -34,6 +34,18 @@ CONSISTENCY = {
     "groundtruth": "noise of the ground truth",
 }
 
+LIVE = {
+    "sequence": "sequence",
+    "frames": "frames",
+    "pose_latency_median": "latency of poses, median, ms",
+    "pose_latency_p95": "95% below, ms",
+    "latency_median": "latency of results, median, ms",
+    "latency_p95": "95% below, ms",
+    "dropped": "frames dropped",
+    "ate": "ATE, m",
+    "offline": "ATE with every frame, m",
+}
+
 LOST = {
     "sequence": "sequence",
     "interruption": "interruption",

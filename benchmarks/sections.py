@@ -135,6 +135,18 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             flat_table(columns.KEYFRAMES),
         ),
     ),
+    "Live": (
+        Part(
+            "live",
+            (
+                "Stored sequences at their own rate, as a camera sends them: `v3d-torch run --config realtime"
+                " --realtime`. The latency is the time from the capture of a frame to its first pose, which `pose_at`"
+                " knows from the motion since the previous frame, and to its result with objects and the pose in the"
+                " map. The last column is the ATE of the same configuration if no frame is dropped."
+            ),
+            flat_table(columns.LIVE),
+        ),
+    ),
     "Recovery of a lost camera": (
         Part(
             "lost",

@@ -28,6 +28,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "growth": ("sequence", "frames"),
     "held_out": ("sequence", "change"),
     "keyframes": ("keyframes",),
+    "live": ("sequence",),
     "lost": ("sequence", "interruption"),
     "map_costs": ("sequence",),
     "maps": ("sequence", "pixels"),
