@@ -131,7 +131,7 @@ class FreeSpaceConfig(Section):
     """
 
     enabled: bool = True
-    """False for the paper's literal rules."""
+    """False for the paper's rules of the object stages."""
     time_spans: tuple[Annotated[float, Field(ge=0, le=10)], ...] = (0.3, 0.9)
     """Times between the depth images that are compared, seconds: a walking person moves 0.3 m in the first, a slow one
     in the second. Depth images are stored for the longest one."""
