@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ FEWER_FRAMES = {
 """Settings of notebooks that replace those for readers: fewer frames, scenes and steps."""
 
 CHECKS = {
+    "quickstart": "assert scores.ate.rmse < 0.01",
     "voting_step_by_step": """
 assert sorted(state for _, label, state in final if label.startswith("person")) == ["deforming", "dynamic", "static"]
 """,
@@ -82,6 +84,12 @@ def test_notebook_runs_with_other_settings(
 ) -> None:
     (path,) = (each for each in NOTEBOOKS if each.stem == name)
     run(path, client, FEWER_FRAMES.get(name, {}) | settings, check)
+
+
+def test_quickstart_runs_without_ground_truth(moment: Path, tmp_path: Path, client: NotebookClient) -> None:
+    folder = shutil.copytree(moment, tmp_path / "recording", ignore=shutil.ignore_patterns("groundtruth.txt"))
+    (path,) = (each for each in NOTEBOOKS if each.stem == "quickstart")
+    run(path, client, {"SEQUENCE": str(folder), "FRAMES": 6}, "assert sequence.groundtruth is None")
 
 
 def test_notebooks_are_small_and_have_no_absolute_paths() -> None:
