@@ -37,6 +37,7 @@ OTHER_SETTINGS = (
     ("voting_step_by_step", {"INDEX": 100}, "assert len(pairs) > 2"),  # the border of the image cuts off a person
     # The photographer stands still, and a walker hides a part of him.
     ("voting_step_by_step", {"INDEX": 40}, "assert all(state != 'deforming' for _, _, state in final)"),
+    ("correct_depth_bias", {"SCALE": 0.96, "OFFSET": -0.02}, ""),
 )
 """Settings that a reader may choose: name of the notebook, values, and a check after its last cell."""
 
