@@ -24,6 +24,7 @@ FEWER_FRAMES = {
 """Settings of notebooks that replace those for readers: fewer frames, scenes and steps."""
 
 CHECKS = {
+    "learn_voting_thresholds": "assert max(CANDIDATES) < present.sum(dim=-1).max()",
     "quickstart": "assert scores.ate.rmse < 0.01",
     "voting_step_by_step": """
 assert sorted(state for _, label, state in final if label.startswith("person")) == ["deforming", "dynamic", "static"]
