@@ -53,6 +53,7 @@ def thresholds(options: argparse.Namespace) -> Iterator[Row]:
         "TRAIN": _parts(options.train, options),
         "TEST": _parts(options.test, options),
         "STEPS": 150,
+        "CANDIDATES": (1, 2, 3),
         "USE_NETWORK": True,
     }
     found = run_notebook("learn_voting_thresholds", settings)

@@ -202,12 +202,11 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             (
                 "Distance threshold and number of votes, learnt from tracked objects of other sequences"
                 ' (`notebooks/learn_voting_thresholds.ipynb`). Scores of "is dynamic" over all detected objects of all'
-                " frames, with the paper's rule, by which the vote alone decides, and with the free-space check of the"
-                " default configuration. The objects are found by the network; an object truly moves if more than half"
-                " of its pixels do. With the paper's rule, the larger threshold finds fewer moving objects and is more"
-                " often right, which helps on one sequence and harms on the other; the free-space check confirms votes"
-                " anyway, so that nothing is gained. The default stays. All composed sequences show people of one"
-                " recording."
+                " frames, with votes alone, without the free-space check, and with the free-space check of the default"
+                " configuration. The objects are found by the network; an object truly moves if more than half of its"
+                " pixels do. With votes alone, the larger threshold finds fewer moving objects and is more often right,"
+                " which helps on one sequence and harms on the other; the free-space check confirms votes anyway, so"
+                " that nothing is gained. The default stays. All composed sequences show people of one recording."
             ),
             flat_table(columns.VOTING_THRESHOLDS),
         ),

@@ -101,6 +101,12 @@ def test_configuration_page_is_written_from_the_schema() -> None:
     assert script["PAGE"].read_text(encoding="utf-8") == script["page"]()
 
 
+def test_pictures_are_outputs_of_the_notebooks() -> None:
+    script = runpy.run_path(str(ROOT / "docs" / "write_pictures.py"))
+    for name, source in script["PICTURES"].items():
+        assert (script["IMAGES"] / name).read_bytes() == script["picture"](*source), name
+
+
 def test_index_of_stages_links_every_stage(pages: dict[str, Page]) -> None:
     stages = {path.stem for path in (ROOT / "docs" / "stages").glob("*.md")} - {"index"}
     text = (ROOT / "docs" / "stages" / "index.md").read_text(encoding="utf-8")

@@ -28,7 +28,8 @@ from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
 _COARSE_COLUMNS = 160
-"""Number of columns of the coarse masks that are compared: the resolution of the network's own masks."""
+"""Number of columns of the coarse masks that are compared: more than the network's own masks have, which is 104 by
+default."""
 
 _DUPLICATE_COVERAGE = 0.7
 """An unmatched instance is a second detection of an object if the mask of a matched instance of the class and its own

@@ -1,7 +1,7 @@
 """Silhouette of a point cloud: pixels near the projected points whose depth agrees with the points.
 
-A segmentation network draws masks at a quarter of the image resolution: it cuts off hands and includes parts of the
-wall. The outlier-free cloud of an object gives the range of depths that belong to the object at each pixel.
+A segmentation network draws masks at a quarter of the resolution of its input: it cuts off hands and includes parts of
+the wall. The outlier-free cloud of an object gives the range of depths that belong to the object at each pixel.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.mask_ops import ellipse
 
 _CELL = 4
-"""Side of the cells that collect the depths of a cloud, pixels: the resolution of the network's masks."""
+"""Side of the cells that collect the depths of a cloud, pixels: smaller than a cell of the network's masks, 6 pixels
+by default."""
 
 _NO_DEPTH = 1e6
 """Depth of cells without points, metres: farther than any measurement."""

@@ -19,7 +19,8 @@ from torch import Tensor
 
 REGULARISATION = 1e-6
 """Number added to all diagonals, which makes blocks without observations solvable. It is small compared with the
-information of an observation, at least 1e4 per square metre."""
+information of an observation across its ray: 3e2 per square metre for a feature of the coarsest pyramid level at 8 m,
+at a focal length of 525 pixels."""
 
 
 class NormalEquations(NamedTuple):
