@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.linalg import lstsq
 from scipy.stats import chi2
 
@@ -72,34 +75,82 @@ def test_kalman_filter_limits_the_speed() -> None:
     torch.testing.assert_close(motion.state.velocity, torch.tensor([1.2, 0.0, 1.6], dtype=torch.float64))
 
 
+class Walk(NamedTuple):
+    """A walk that a filter has tracked: the true values at its last measurement, and where the walk is a step later."""
+
+    motion: ConstantVelocityKalmanFilter
+    seen: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    next_position: NDArray[np.float64]
+    next_velocity: NDArray[np.float64]
+
+
+STEP = 0.1
+"""Time between two measurements of a walk, seconds."""
+
+
+def simulate(generator: np.random.Generator, sigmas: Iterable[float], scale: float = 1.0) -> Walk:
+    """Track a walk with white acceleration noise and a changing visible part; `scale` times the assumed noise."""
+    motion = ConstantVelocityKalmanFilter(TrackerConfig(max_speed=1e6, acceleration_noise=2.0))
+    noise = 2.0**2 * np.array([[STEP**3 / 3, STEP**2 / 2], [STEP**2 / 2, STEP]])
+    step, correlation = scale * np.linalg.cholesky(noise), math.exp(-STEP / 2.0)
+    position, velocity, part = np.zeros(3), generator.normal(size=3), generator.normal(size=3)
+    for k, sigma in enumerate(sigmas):
+        fast = math.sqrt(1 - SLOW) * generator.normal(size=3)
+        seen = position + scale * sigma * (math.sqrt(SLOW) * part + fast)
+        motion.update(k * STEP, torch.from_numpy(seen + scale * NOISE * generator.normal(size=3)), sigma)
+        moving, change = velocity, step @ generator.normal(size=(2, 3))
+        position, velocity = position + STEP * velocity + change[0], velocity + change[1]
+        part = correlation * part + math.sqrt(1 - correlation**2) * generator.normal(size=3)
+    return Walk(motion, seen, moving, position, velocity)
+
+
 def test_covariance_of_the_filter_is_that_of_its_errors() -> None:
-    """Monte Carlo: walks with white acceleration noise and a changing visible part; 500 whitened errors."""
-    generator, config = np.random.default_rng(0), TrackerConfig(max_speed=1e6, acceleration_noise=2.0)
-    dt, squared, of_visible = 0.1, [], []
-    noise = 2.0**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    step, correlation = np.linalg.cholesky(noise), math.exp(-dt / 2.0)
-    sigmas = [0.3, 0.2, *[0.05] * 6, 0.1, 0.2, 0.3, *[0.1] * 4]  # enters the image, and walks behind a table
+    """Monte Carlo: 500 walks into the image, and behind a table."""
+    generator, squared, whitened = np.random.default_rng(0), [], []
+    sigmas = [0.3, 0.2, *[0.05] * 6, 0.1, 0.2, 0.3, *[0.1] * 4]
     for _ in range(500):
-        motion = ConstantVelocityKalmanFilter(config)
-        position, velocity, part = np.zeros(3), generator.normal(size=3), generator.normal(size=3)
-        for k, sigma in enumerate(sigmas):
-            fast = math.sqrt(1 - SLOW) * generator.normal(size=3)
-            seen = position + sigma * (math.sqrt(SLOW) * part + fast)
-            motion.update(k * dt, torch.from_numpy(seen + NOISE * generator.normal(size=3)), sigma)
-            moving, change = velocity, step @ generator.normal(size=(2, 3))
-            position, velocity = position + dt * velocity + change[0], velocity + change[1]
-            part = correlation * part + math.sqrt(1 - correlation**2) * generator.normal(size=3)
-        predicted = motion.state.predict(len(sigmas) * dt)
-        error = np.concatenate([predicted.position.numpy() - position, predicted.velocity.numpy() - velocity])
+        walk = simulate(generator, sigmas)
+        predicted = walk.motion.state.predict(len(sigmas) * STEP)
+        error = np.concatenate(
+            [predicted.position.numpy() - walk.next_position, predicted.velocity.numpy() - walk.next_velocity]
+        )
         squared.append(error @ np.linalg.solve(predicted.covariance.numpy(), error))
-        visible = motion.visible_state
-        of_visible.append(np.stack([visible.position.numpy() - seen, visible.velocity.numpy() - moving], axis=1))
+        visible = walk.motion.visible_state
+        pp, pv, vv = visible.variances
+        of_visible = np.stack([visible.position.numpy() - walk.seen, visible.velocity.numpy() - walk.velocity])
+        whitened.append(np.linalg.solve(np.linalg.cholesky(np.array([[pp, pv], [pv, vv]])), of_visible))
     low, high = chi2.ppf([0.001, 0.999], 6 * len(squared)) / len(squared)
     assert low < np.mean(squared) < high
     # Whitened errors of position and velocity of the visible part, on the three axes of all walks.
-    pp, pv, vv = visible.variances
-    whitened = np.linalg.solve(np.linalg.cholesky(np.array([[pp, pv], [pv, vv]])), np.concatenate(of_visible).T)
-    np.testing.assert_allclose(whitened @ whitened.T / 1500, np.eye(2), atol=3 * (2 / 1500) ** 0.5)
+    errors = np.concatenate(whitened, axis=1)
+    np.testing.assert_allclose(errors @ errors.T / 1500, np.eye(2), atol=3 * (2 / 1500) ** 0.5)
+
+
+@pytest.mark.parametrize("scale", [0.3, 1.0, 1.5])
+def test_velocity_for_users_is_as_uncertain_as_the_measurements_show(scale: float) -> None:
+    """Monte Carlo: 150 walks of 10 s with less noise than the filter assumes, as much, and more."""
+    generator = np.random.default_rng(0)
+    walks = [simulate(generator, [0.1] * 100, scale) for _ in range(150)]
+    states = [walk.motion.visible_state for walk in walks]
+    for state in states:
+        assert float(torch.linalg.eigvalsh(state.covariance).min()) > 0
+    errors = [state.velocity.numpy() - walk.velocity for state, walk in zip(states, walks, strict=True)]
+    normalised = [error @ error / state.variances[2] for error, state in zip(errors, states, strict=True)]
+    assert np.mean(normalised) / 3 == pytest.approx(1, abs=0.25)
+    # The acceleration of the walks is smaller or larger in the same proportion; that of the filter stays.
+    assert np.median([state.acceleration_noise for state in states]) == pytest.approx(2.0 * scale, rel=0.15)
+    assert {walk.motion.state.acceleration_noise for walk in walks} == {2.0}
+
+
+@pytest.mark.parametrize(("error", "factor"), [(0.0, 0.05), (2.0, 4.0)])
+def test_factor_of_the_variances_is_bounded(error: float, factor: float) -> None:
+    """Measurements without noise leave some uncertainty, and masks that jump by metres do not make it endless."""
+    motion, generator = ConstantVelocityKalmanFilter(TrackerConfig()), torch.Generator().manual_seed(0)
+    for frame in range(600):
+        position = error * torch.randn(3, generator=generator, dtype=torch.float64)
+        motion.update(frame / 30, position, 0.05)
+    assert motion.visible_state.variances[2] == pytest.approx(factor * motion.state.variances[2])
 
 
 def test_velocity_of_a_part_is_known_sooner_than_the_place_of_the_whole() -> None:

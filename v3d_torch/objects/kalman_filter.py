@@ -22,6 +22,13 @@ _SLOW_FRACTION, _SLOW_TIME = 0.5, 2.0
 and its time constant, seconds: within seconds a person turns, or others walk by. The rest differs in each frame,
 because masks end at different places."""
 
+_FACTOR_TIME, _FACTOR_PRIOR = 4.0, 5.0
+"""Time constant of the mean of the variance factor, seconds, and weight of the prior that it is 1, in measurements:
+a person walks in the same way for some seconds."""
+
+_MIN_FACTOR, _MAX_FACTOR = 0.05, 4.0
+"""Range of the variance factor: someone who walks evenly can still turn, and a jump of the mask is no motion."""
+
 _MIN_SPEED = 1e-9
 """Lower bound of the speed as a divisor, m/s."""
 
@@ -34,12 +41,19 @@ class ConstantVelocityKalmanFilter:
     Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec. 8.4), and belongs to the state of
     the filter: as white noise, it would be confused with motion.
 
+    The filter assumes as much noise as there can be, so that ids hold where masks jump and people turn. Most measured
+    positions are much nearer to the prediction. The covariances of velocity and acceleration that users get are
+    therefore multiplied by the variance factor that the measurements show: the mean of the normalised squared
+    innovations (same book, Sec. 5.4), which is 1 if the assumed noise is right. The error of a position comes from the
+    mask, and not from the motion.
+
     Args:
         config: Noise and maximum speed.
 
     Attributes:
         state: Estimate for the whole object after the last measurement, see `ObjectState`.
-        visible_state: Estimate for its visible part, with the same velocity.
+        visible_state: Estimate for its visible part, with the same velocity, and with the covariance that the
+            measurements show.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -51,6 +65,7 @@ class ConstantVelocityKalmanFilter:
         self._offset = torch.zeros_like(position)  # its slow part
         self._offset_covariances = 0.0, 0.0, 0.0  # with position and velocity, and variance
         self._offset_sigma = 0.0
+        self._squared_innovations, self._measurements = _FACTOR_PRIOR, _FACTOR_PRIOR  # sums with decaying weights
 
     def update(self, stamp: float, position: Tensor, sigma: float) -> None:
         """Update the state with a measured position of the visible part.
@@ -63,8 +78,9 @@ class ConstantVelocityKalmanFilter:
         if not bool(torch.isfinite(position).all()):
             return
         if self.state.is_known:
+            elapsed = stamp - self.state.stamp
             self._predict(stamp, sigma)
-            self._correct(position)
+            self._correct(position, elapsed)
         else:
             self._start(stamp, position, sigma)
 
@@ -96,13 +112,14 @@ class ConstantVelocityKalmanFilter:
         variance = scale**2 * oo + (1 - correlation**2) * _SLOW_FRACTION * sigma**2
         self._offset_covariances, self._offset_sigma = (scale * (po + dt * vo), scale * vo, variance), sigma
 
-    def _correct(self, measured: Tensor) -> None:
+    def _correct(self, measured: Tensor, elapsed: float) -> None:
         """Correct the predicted state with a measurement: the sum of position, both parts of the offset, and noise."""
         (pp, pv, vv), (po, vo, oo) = self.state.variances, self._offset_covariances
         p, v, o = pp + po, pv + vo, po + oo  # covariances with the measurement
         variance = p + o + (1 - _SLOW_FRACTION) * self._offset_sigma**2 + _CENTROID_SIGMA**2
         innovation = measured - self.state.position - self._offset
         weighted = innovation / variance
+        factor = self._update_factor(float(innovation @ weighted) / len(innovation), elapsed)
         velocity = self.state.velocity + v * weighted
         self.state = replace(
             self.state,
@@ -111,10 +128,19 @@ class ConstantVelocityKalmanFilter:
             variances=(pp - p * p / variance, pv - p * v / variance, vv - v * v / variance),
         )
         noise_fraction = _CENTROID_SIGMA**2 / variance
+        position_variance, covariance = _CENTROID_SIGMA**2 * (1 - noise_fraction), v * noise_fraction
         self.visible_state = replace(
             self.state,
             position=measured - noise_fraction * innovation,
-            variances=(_CENTROID_SIGMA**2 * (1 - noise_fraction), v * noise_fraction, self.state.variances[2]),
+            variances=(position_variance, math.sqrt(factor) * covariance, factor * self.state.variances[2]),
+            acceleration_noise=math.sqrt(factor) * self.state.acceleration_noise,
         )
         self._offset = self._offset + o * weighted
         self._offset_covariances = po - p * o / variance, vo - v * o / variance, oo - o * o / variance
+
+    def _update_factor(self, squared_innovation: float, elapsed: float) -> float:
+        """Add a normalised squared innovation, 1 is expected, and return the variance factor."""
+        kept = math.exp(-elapsed / _FACTOR_TIME)
+        self._squared_innovations = kept * self._squared_innovations + squared_innovation
+        self._measurements = kept * self._measurements + 1
+        return min(max(self._squared_innovations / self._measurements, _MIN_FACTOR), _MAX_FACTOR)
