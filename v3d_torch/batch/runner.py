@@ -47,10 +47,12 @@ def run_batch(
     console = wide_console()
     configs = load_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
     check_configs(configs.values())
-    names = matching_sequences(patterns, data_root)
+    matches = matching_sequences(patterns, data_root)
+    for note in matches.notes:
+        print_line(console, f"note: {note}")
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
-    opened = open_sequences(names, data_root, console, skip_broken=skip_broken)
-    sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
+    opened = open_sequences(matches.sequences, data_root, console, skip_broken=skip_broken)
+    sequences = {name: (source, opened[name]) for source, name in zip(matches.sequences, opened, strict=True)}
     prepare_stages(configs)
     folder = make_result_folder(out, "batch")
     jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder, skip_broken=skip_broken)
