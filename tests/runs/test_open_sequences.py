@@ -54,3 +54,18 @@ def test_two_sequences_with_the_same_name_are_rejected(tmp_path: Path) -> None:
         write_base(folder)
     with pytest.raises(InputError, match=re.escape(f"{second}: {first} has the same name, seq; run them separately")):
         open_sequences([str(first), str(second)], None, Console())
+
+
+def test_all_sequences_that_are_not_valid_are_named(tmp_path: Path) -> None:
+    names = [tmp_path / name for name in ("good", "empty", "missing", "damaged")]
+    for folder in (names[0], names[3]):
+        write_base(folder)
+    names[1].mkdir()
+    (names[3] / "groundtruth.txt").write_text("1 2 3\n")
+    output = StringIO()
+    with pytest.raises(InputError, match=f"^3 of 4 sequences are not valid, the first: {re.escape(str(names[1]))}: "):
+        open_sequences([*map(str, names), str(names[1])], None, Console(file=output, width=300))
+    heading, *lines = output.getvalue().splitlines()
+    assert heading == "not valid:" and len(lines) == 3
+    for name, line in zip(names[1:], lines, strict=True):
+        assert line.startswith(str(name))

@@ -59,19 +59,33 @@ def open_sequences(
 ) -> dict[str, RGBDSequence]:
     """Open several sequences in the given order, before the first of them is run; see `load_sequence`.
 
+    All sequences are opened before an error is raised. If several are not valid, a line is printed for each.
+
     Returns:
         Sequences by their name in tables.
 
     Raises:
-        InputError: If a sequence is not valid, or two sequences have the same name.
+        InputError: If sequences are not valid, or two sequences have the same name.
         DownloadError: If a sequence is missing and cannot be downloaded.
     """
     sequences: dict[str, RGBDSequence] = {}
     sources: dict[str, str] = {}
-    for name in dict.fromkeys(names):
-        sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
-        check_groundtruth(sequence)  # runs are compared by their scores
-        if (other := sources.setdefault(sequence.name, name)) != name:
-            raise InputError(f"{name}: {other} has the same name, {sequence.name}; run them separately")
-        sequences[sequence.name] = sequence
+    errors: list[InputError] = []
+    names = list(dict.fromkeys(names))
+    for name in names:
+        try:
+            sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
+            check_groundtruth(sequence)  # runs are compared by their scores
+            if (other := sources.setdefault(sequence.name, name)) != name:
+                raise InputError(f"{name}: {other} has the same name, {sequence.name}; run them separately")
+            sequences[sequence.name] = sequence
+        except InputError as error:
+            errors.append(error)
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        console.print("not valid:")
+        for invalid in errors:
+            print_line(console, str(invalid))
+        raise InputError(f"{len(errors)} of {len(names)} sequences are not valid, the first: {errors[0]}")
     return sequences
