@@ -133,7 +133,8 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                         print_line(progress.console, str(outcome))
                         for warning in outcome.warnings:
                             print_line(progress.console, f"warning: {warning}")
-                        progress.table = next(iter(record.screen_tables()), None)
+                        if console.is_terminal and (table := record.live_table()) is not None:
+                            show.show_table(table)
                         try:
                             record.write()
                         except OutputError as error:  # the running jobs can still finish
