@@ -311,6 +311,9 @@ def test_map_with_other_settings_is_rejected(setting: str, tmp_path: Path) -> No
         ("observation/feature", 0, 20),
         ("feature/landmark", 3, -2),
         ("feature/pixel", 3, 320),
+        ("feature/octave", 3, 100),
+        ("feature/octave", 3, -1),
+        ("observation/octave", 3, 8),
         ("feature/sigma_ratio", 3, 0.0),
         ("observation/sigma_ratio", 3, -1.0),
         ("landmark/keyframe", 2, 4),
@@ -330,6 +333,22 @@ def test_inconsistent_values_are_rejected(name: str, row: int, value: float, tmp
     column[row] = value
     rewrite(path, **{name.replace("/", "__"): column})
     with pytest.raises(InputError, match=rf"room\.map: is a damaged map file \({name}"):
+        load_map(path, CAMERA, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(slice(3), slice(3), 2.0), (0, slice(4), -1.0), (3, 1, 1e-3), (slice(4), 2, 0.0)]
+)
+@pytest.mark.parametrize("name", ["keyframe/T_cw", "loop/T_ij"])
+def test_poses_that_are_no_rigid_motions_are_rejected(
+    name: str, row: int | slice, column: int | slice, value: float, tmp_path: Path
+) -> None:
+    path = write_map(tmp_path, random_map())
+    with np.load(path) as file:
+        poses = file[name].copy()
+    poses[-1, row, column] = value if value == 1e-3 else value * poses[-1, row, column]
+    rewrite(path, **{name.replace("/", "__"): poses})
+    with pytest.raises(InputError, match=rf"damaged map file \({name} has matrices that are not rigid motions\)"):
         load_map(path, CAMERA, CONFIG)
 
 
