@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import pickle
@@ -77,6 +78,27 @@ def write_map(tmp_path: Path, stored: StoredMap) -> Path:
 
 
 # --- round trip
+
+
+def test_landmarks_that_are_not_in_use_are_not_saved(tmp_path: Path) -> None:
+    stored = random_map()
+    count, unused = len(stored.map.landmarks), torch.tensor([2, 17])
+    observed = torch.isin(stored.map.observations["landmark"], unused)
+    stored.map.remove_observations(torch.nonzero(observed)[:, 0])
+    stored.map.observations.keep_rows(~observed)
+    stored.map.landmarks["active"][unused] = False
+    before = copy.deepcopy(stored.map.landmarks.columns)
+    loaded = load_map(write_map(tmp_path, stored), CAMERA, CONFIG).map
+    assert len(loaded.landmarks) == count - 2 and not loaded.landmarks["active"].all()
+    for tables in (stored.map, loaded):
+        assert torch.equal(tables.observations["valid"], stored.map.observations["valid"])
+        points = tables.landmarks["point"][tables.observations["landmark"]]
+        assert torch.equal(points, before["point"][stored.map.observations["landmark"]])
+    for own, other in zip(stored.map.keyframes, loaded.keyframes, strict=True):
+        assert torch.equal(own.landmarks < 0, other.landmarks < 0)
+        points = loaded.landmarks["point"][other.observed_landmarks]
+        assert torch.equal(points, before["point"][own.observed_landmarks])
+    assert all(torch.equal(column, before[name]) for name, column in stored.map.landmarks.columns.items())
 
 
 @pytest.mark.parametrize("keyframes", [0, 1, 4])

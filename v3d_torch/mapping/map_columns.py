@@ -12,6 +12,7 @@ from v3d_torch.features.features import Features
 from v3d_torch.features.scale_pyramid import octaves_of_levels
 from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.mapping.landmark_ids import compacted_ids, find_landmarks_in_use
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticView, StaticViews
@@ -33,11 +34,15 @@ _MOTION_TOLERANCE = 1e-6
 def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
     """Convert a map and its views to columns. An empty map gives empty columns of the right type and shape.
 
+    Landmarks that are not in use are left out; the IDs of the others are their rows in the columns.
+
     Args:
         tables: Data of the map.
         views: Static views of its keyframes.
     """
     keyframes, features = _empty_tables()
+    in_use = find_landmarks_in_use(tables)
+    new_id = compacted_ids(in_use)
     for keyframe in tables.keyframes:
         keyframes.append(
             stamp=torch.tensor([keyframe.stamp], dtype=torch.float64),
@@ -46,15 +51,15 @@ def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
             reference=torch.tensor([keyframe.reference]),
             feature_count=torch.tensor([len(keyframe.features)]),
         )
-        features.append(**vars(keyframe.features), landmark=keyframe.landmarks)
+        features.append(**vars(keyframe.features), landmark=new_id[keyframe.landmarks])
     loops, size = tables.loops, (views.camera.height, views.camera.width)
     depth_units = [torch.zeros(0, *size, dtype=torch.uint16), *(view.depth_units[None] for view in views)]
     colours = [torch.zeros(0, 3, *size, dtype=torch.uint8), *(view.colour[None] for view in views)]
     groups = {
         "keyframe": keyframes.columns,
         "feature": features.columns,
-        "landmark": tables.landmarks.columns,
-        "observation": tables.observations.columns,
+        "landmark": {name: column[in_use] for name, column in tables.landmarks.columns.items()},
+        "observation": tables.observations.columns | {"landmark": new_id[tables.observations["landmark"]]},
         "loop": {
             "i": torch.tensor([loop.i for loop in loops], dtype=torch.int64),
             "j": torch.tensor([loop.j for loop in loops], dtype=torch.int64),
