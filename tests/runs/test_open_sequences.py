@@ -15,7 +15,7 @@ from rich.console import Console
 
 from v3d_torch.datasets.demo.sequence import CAMERA
 from v3d_torch.errors import InputError
-from v3d_torch.runs.open_sequences import open_sequences, print_notes
+from v3d_torch.runs.open_sequences import open_sequence, open_sequences, print_notes
 
 
 def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
@@ -24,6 +24,17 @@ def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
     with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
         open_sequences([str(tmp_path / "seq")], None, Console())
+
+
+@pytest.mark.filterwarnings("ignore::v3d_torch.errors.GroundTruthWarning")
+def test_damaged_ground_truth_is_noted_before_a_run(tmp_path: Path) -> None:
+    write_base(tmp_path / "seq")
+    output = StringIO()
+    for _ in range(2):
+        open_sequence(str(tmp_path / "seq"), None, Console(file=output, width=300))
+        (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
+    (note,) = output.getvalue().splitlines()
+    assert note.startswith(f"note: seq: no ground truth, and so no scores: {tmp_path / 'seq' / 'groundtruth.txt'}: ")
 
 
 @pytest.mark.parametrize(
