@@ -363,7 +363,7 @@ def test_compaction_of_the_map_leaves_poses_and_landmarks_identical(
     """Compaction removes unused landmarks and renumbers the others; nothing else changes."""
     runs = {}
     for name, max_ratio in (("never", math.inf), ("with every keyframe", 0)):
-        monkeypatch.setattr("v3d_torch.mapping.landmark_ids._MAX_LANDMARKS_PER_OBSERVATION", max_ratio)
+        monkeypatch.setattr("v3d_torch.mapping.landmark_ids._COMPACTION_RATIO", max_ratio)
         slam = V3DSLAM(demo.camera, config=load_config(None, ("segmentation.source=none",)))
         for index in range(0, 120, 4):
             slam(demo[index])

@@ -8,7 +8,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 import v3d_torch
-from v3d_torch.batch.batch_record import write_runs
+from v3d_torch.batch.batch_record import BatchRecord, write_runs
+from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.config import Config
 from v3d_torch.evaluation.outcome import Outcome
@@ -30,3 +31,18 @@ def test_table_of_runs_has_each_warning_in_its_own_line(tmp_path: Path) -> None:
     write_runs(tmp_path / "runs.parquet", [(job, Outcome("room", "full", 0, metrics)), (job, job.make_outcome("lost"))])
     written = pq.read_table(tmp_path / "runs.parquet")["warnings"].to_pylist()
     assert written == ["the depth seems to be late\nred and blue seem to be swapped", ""]
+
+
+def test_sequence_of_the_newest_outcome_is_last(tmp_path: Path) -> None:
+    jobs = [
+        Job(name, name, 1, "", None, config, Config(), tmp_path / name / config / "seed0")
+        for name in ("attic", "cellar", "hall")
+        for config in ("full", "paper")
+    ]
+    record = BatchRecord(jobs, tmp_path)
+    for job in (jobs[4], jobs[1], jobs[0], jobs[5]):
+        record.add(JobFinished(job, "it broke"))
+    newest_last = [(outcome.sequence, outcome.config) for outcome in record.newest_last]
+    assert newest_last == [("attic", "full"), ("attic", "paper"), ("hall", "full"), ("hall", "paper")]
+    record.add(JobFinished(jobs[2], "it broke"))
+    assert record.newest_last[-1].sequence == "cellar"

@@ -115,6 +115,10 @@ def test_failed_run_is_reported_and_others_finish(done: Result, work: Path) -> N
         assert str(image) in metrics_of(folder)["failure"]
 
 
+def test_folders_that_are_no_sequence_are_noted(done: Result) -> None:
+    assert "note: *: 1 folder is no sequence and is left out: notes" in done.stdout.splitlines()
+
+
 def test_output_without_terminal_has_no_progress_bars(done: Result) -> None:
     assert "\x1b" not in done.stdout and "all runs" not in done.stdout
     assert sum(line.startswith(("good, ", "broken, ")) for line in done.stdout.splitlines()) == 4 + 2

@@ -178,7 +178,7 @@ def test_batch_passes_over_broken_frames_and_keeps_finished_runs(
         return invoke(batch.app, *arguments, *more, V3D_DATA="", NO_COLOR="1")
 
     done = call_batch()
-    assert_error_line(done, "1 of 2 runs failed")
+    assert_error_line(done, "1 of 2 runs failed", "again, with --skip-broken if broken frames ended them")
     assert str(frame) in done.stdout
     finished = (tmp_path / "out" / "good" / "baseline" / "seed0" / "metrics.json").stat().st_mtime_ns
     done = call_batch("--resume", "--skip-broken")

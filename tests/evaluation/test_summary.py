@@ -243,3 +243,28 @@ def test_part_of_a_sequence_is_marked_in_all_tables() -> None:
 
 def test_name_in_tables_is_one_line_without_control_characters() -> None:
     assert label_sequence("a\nb\x1b[31m", "part: 3 of 9 frames") == "a\\nb\\x1b[31m (part: 3 of 9 frames)"
+
+
+def test_tables_read_each_outcome_a_fixed_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tables are made after each run of a batch, which can have thousands."""
+    reads = 0
+
+    class CountedOutcome(Outcome):
+        def __getattribute__(self, name: str) -> Any:
+            nonlocal reads
+            reads += 1
+            return super().__getattribute__(name)
+
+    def reads_per_outcome(sequences: int) -> float:
+        nonlocal reads
+        outcomes = [
+            CountedOutcome(run.sequence, run.config, run.seed, run.metrics)
+            for k in range(sequences)
+            for config in ("full", "paper")
+            for run in runs(f"room_{k}", config, 0.1, 0.2)
+        ]
+        reads = 0
+        format_markdown(outcomes), format_latex(outcomes), format_csv(outcomes), make_screen_tables(outcomes)
+        return reads / len(outcomes)
+
+    assert reads_per_outcome(32) == reads_per_outcome(2)

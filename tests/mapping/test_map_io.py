@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import pickle
@@ -77,6 +78,27 @@ def write_map(tmp_path: Path, stored: StoredMap) -> Path:
 
 
 # --- round trip
+
+
+def test_landmarks_that_are_not_in_use_are_not_saved(tmp_path: Path) -> None:
+    stored = random_map()
+    count, unused = len(stored.map.landmarks), torch.tensor([2, 17])
+    observed = torch.isin(stored.map.observations["landmark"], unused)
+    stored.map.remove_observations(torch.nonzero(observed)[:, 0])
+    stored.map.observations.keep_rows(~observed)
+    stored.map.landmarks["active"][unused] = False
+    before = copy.deepcopy(stored.map.landmarks.columns)
+    loaded = load_map(write_map(tmp_path, stored), CAMERA, CONFIG).map
+    assert len(loaded.landmarks) == count - 2 and not loaded.landmarks["active"].all()
+    for tables in (stored.map, loaded):
+        assert torch.equal(tables.observations["valid"], stored.map.observations["valid"])
+        points = tables.landmarks["point"][tables.observations["landmark"]]
+        assert torch.equal(points, before["point"][stored.map.observations["landmark"]])
+    for own, other in zip(stored.map.keyframes, loaded.keyframes, strict=True):
+        assert torch.equal(own.landmarks < 0, other.landmarks < 0)
+        points = loaded.landmarks["point"][other.observed_landmarks]
+        assert torch.equal(points, before["point"][own.observed_landmarks])
+    assert all(torch.equal(column, before[name]) for name, column in stored.map.landmarks.columns.items())
 
 
 @pytest.mark.parametrize("keyframes", [0, 1, 4])
@@ -311,6 +333,9 @@ def test_map_with_other_settings_is_rejected(setting: str, tmp_path: Path) -> No
         ("observation/feature", 0, 20),
         ("feature/landmark", 3, -2),
         ("feature/pixel", 3, 320),
+        ("feature/octave", 3, 100),
+        ("feature/octave", 3, -1),
+        ("observation/octave", 3, 8),
         ("feature/sigma_ratio", 3, 0.0),
         ("observation/sigma_ratio", 3, -1.0),
         ("landmark/keyframe", 2, 4),
@@ -330,6 +355,22 @@ def test_inconsistent_values_are_rejected(name: str, row: int, value: float, tmp
     column[row] = value
     rewrite(path, **{name.replace("/", "__"): column})
     with pytest.raises(InputError, match=rf"room\.map: is a damaged map file \({name}"):
+        load_map(path, CAMERA, CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(slice(3), slice(3), 2.0), (0, slice(4), -1.0), (3, 1, 1e-3), (slice(4), 2, 0.0)]
+)
+@pytest.mark.parametrize("name", ["keyframe/T_cw", "loop/T_ij"])
+def test_poses_that_are_no_rigid_motions_are_rejected(
+    name: str, row: int | slice, column: int | slice, value: float, tmp_path: Path
+) -> None:
+    path = write_map(tmp_path, random_map())
+    with np.load(path) as file:
+        poses = file[name].copy()
+    poses[-1, row, column] = value if value == 1e-3 else value * poses[-1, row, column]
+    rewrite(path, **{name.replace("/", "__"): poses})
+    with pytest.raises(InputError, match=rf"damaged map file \({name} has matrices that are not rigid motions\)"):
         load_map(path, CAMERA, CONFIG)
 
 

@@ -183,6 +183,21 @@ def test_compaction_of_a_map_without_landmarks_changes_nothing() -> None:
     assert len(sparse_map.landmarks) == 0 and keyframe.landmarks.tolist() == [-1] * 5
 
 
+def test_map_of_mostly_unused_landmarks_is_compacted_however_often_the_others_are_observed() -> None:
+    sparse_map = make_map()
+    sparse_map.insert_keyframe(0, 0.0, EYE, features(60), unmatched(60))
+    newest = [insert(sparse_map, list(range(5, 25)), seed=seed) for seed in range(5)][-1]
+    sparse_map.landmarks["active"][20:] = False
+    compact_landmarks(sparse_map, [])
+    assert len(sparse_map.landmarks) == 60  # the first keyframe observes all
+    cull_keyframes(sparse_map, {0: 1})
+    points = sparse_map.landmarks["point"][5:25].clone()
+    external = torch.tensor([24, -1, 5])
+    compact_landmarks(sparse_map, [external])
+    assert torch.equal(sparse_map.landmarks["point"], points) and len(sparse_map.observations) == 100
+    assert external.tolist() == [19, -1, 0] and newest.landmarks.tolist() == list(range(20))
+
+
 def test_landmarks_move_with_the_keyframe_that_created_them() -> None:
     sparse_map = make_map()
     sparse_map.insert_keyframe(0, 0.0, EYE, features(20), unmatched(20))

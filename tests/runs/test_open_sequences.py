@@ -15,7 +15,7 @@ from rich.console import Console
 
 from v3d_torch.datasets.demo.sequence import CAMERA
 from v3d_torch.errors import InputError
-from v3d_torch.runs.open_sequences import open_sequences, print_notes
+from v3d_torch.runs.open_sequences import open_sequence, open_sequences, print_notes
 
 
 def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
@@ -24,6 +24,17 @@ def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
     with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
         open_sequences([str(tmp_path / "seq")], None, Console())
+
+
+@pytest.mark.filterwarnings("ignore::v3d_torch.errors.GroundTruthWarning")
+def test_damaged_ground_truth_is_noted_before_a_run(tmp_path: Path) -> None:
+    write_base(tmp_path / "seq")
+    output = StringIO()
+    for _ in range(2):
+        open_sequence(str(tmp_path / "seq"), None, Console(file=output, width=300))
+        (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
+    (note,) = output.getvalue().splitlines()
+    assert note.startswith(f"note: seq: no ground truth, and so no scores: {tmp_path / 'seq' / 'groundtruth.txt'}: ")
 
 
 @pytest.mark.parametrize(
@@ -54,3 +65,18 @@ def test_two_sequences_with_the_same_name_are_rejected(tmp_path: Path) -> None:
         write_base(folder)
     with pytest.raises(InputError, match=re.escape(f"{second}: {first} has the same name, seq; run them separately")):
         open_sequences([str(first), str(second)], None, Console())
+
+
+def test_all_sequences_that_are_not_valid_are_named(tmp_path: Path) -> None:
+    names = [tmp_path / name for name in ("good", "empty", "missing", "damaged")]
+    for folder in (names[0], names[3]):
+        write_base(folder)
+    names[1].mkdir()
+    (names[3] / "groundtruth.txt").write_text("1 2 3\n")
+    output = StringIO()
+    with pytest.raises(InputError, match=f"^3 of 4 sequences are not valid, the first: {re.escape(str(names[1]))}: "):
+        open_sequences([*map(str, names), str(names[1])], None, Console(file=output, width=300))
+    heading, *lines = output.getvalue().splitlines()
+    assert heading == "not valid:" and len(lines) == 3
+    for name, line in zip(names[1:], lines, strict=True):
+        assert line.startswith(str(name))

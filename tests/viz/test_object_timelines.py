@@ -51,3 +51,16 @@ def test_one_or_two_frames_are_drawn(frames: int) -> None:
     stamps = arc().stamps[:frames].tolist()
     table = [ObjectRow(stamps[0], 1, "cup", "static", 0, float("nan"))]
     assert embed_svg(draw_object_timelines(stamps, table, None)[0], "objects").startswith("<svg")
+
+
+@pytest.mark.parametrize("most", [1, 2, 3, 9])
+def test_colour_scale_of_votes_has_whole_numbers(most: int) -> None:
+    stamps = [0.1 * t for t in range(10)]
+    table = [ObjectRow(stamp, 1, "person", "dynamic", 1 + t % most, float("nan")) for t, stamp in enumerate(stamps)]
+    figure, _ = draw_object_timelines(stamps, table, None)
+    figure.canvas.draw()
+    scale = figure.axes[-1]
+    labels = [tick.get_text() for tick in scale.get_yticklabels()]
+    low, high = scale.get_ylim()
+    shown = [label for tick, label in zip(scale.get_yticks(), labels, strict=True) if low <= tick <= high]
+    assert shown and all(label.isdecimal() for label in shown), shown

@@ -25,9 +25,11 @@ from v3d_torch.evaluation.summary import (
     format_csv,
     format_latex,
     format_markdown,
+    make_live_table,
     make_screen_tables,
 )
 from v3d_torch.evaluation.tables import (
+    ErrorTable,
     format_latex_document,
     format_markdown_table,
     make_screen_legend,
@@ -105,7 +107,11 @@ class ReproductionRecord(BatchRecord):
 
     @property
     def _table_outcomes(self) -> list[Outcome]:
-        return [outcome for outcome in self.outcomes if outcome.config in self._table_configs]
+        return self._select(self.outcomes)
+
+    def _select(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        """Select the outcomes of the paper's tables."""
+        return [outcome for outcome in outcomes if outcome.config in self._table_configs]
 
     @property
     def _study_outcomes(self) -> list[Outcome]:
@@ -133,6 +139,10 @@ class ReproductionRecord(BatchRecord):
             write_text(self.folder / "ablation.md", "\n".join(document) + "\n")
             write_text(self.folder / "ablation.tex", format_latex_document([table], legend))
             write_text(self.folder / "ablation.csv", ablation.format_csv(self._study_outcomes))
+
+    def live_table(self) -> ErrorTable | None:
+        """Return the first of the paper's tables, to show while jobs run; None if there are no errors yet."""
+        return make_live_table(self._select(self.newest_last), self._absent)
 
     def screen_tables(self) -> list[RenderableType]:
         """Return the paper's tables and that of the study for the screen, and their explanations."""

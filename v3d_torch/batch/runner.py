@@ -47,15 +47,18 @@ def run_batch(
     console = wide_console()
     configs = load_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
     check_configs(configs.values())
-    names = matching_sequences(patterns, data_root)
+    matches = matching_sequences(patterns, data_root)
+    for note in matches.notes:
+        print_line(console, f"note: {note}")
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
-    opened = open_sequences(names, data_root, console, skip_broken=skip_broken)
-    sequences = {name: (source, opened[name]) for source, name in zip(names, opened, strict=True)}
+    opened = open_sequences(matches.sequences, data_root, console, skip_broken=skip_broken)
+    sequences = {name: (source, opened[name]) for source, name in zip(matches.sequences, opened, strict=True)}
     prepare_stages(configs)
     folder = make_result_folder(out, "batch")
     jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder, skip_broken=skip_broken)
     with lock_results(folder):
-        run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume)
+        advice = "" if skip_broken else ", with --skip-broken if broken frames ended them"
+        run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume, advice=advice)
 
 
 def check_resume(resume: bool, out: Path | None) -> None:
@@ -64,7 +67,9 @@ def check_resume(resume: bool, out: Path | None) -> None:
         raise InputError("--resume: no folder to resume; pass the folder of the batch with --out")
 
 
-def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, *, resume: bool) -> None:
+def run_missing_jobs(
+    record: BatchRecord, executor: Executor, console: Console, *, resume: bool, advice: str = ""
+) -> None:
     """Run the jobs of a batch that have no outcome yet; show the progress and write the tables.
 
     Args:
@@ -72,6 +77,7 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
         executor: Executor of the jobs.
         console: Console for the progress, and for the tables at the end.
         resume: True if the folder can contain complete runs; they are not run again.
+        advice: End of the message on failed runs: how to repeat them other than with --resume.
 
     Raises:
         V3DError: If the folder contains runs, or its tables have runs that are not jobs of this batch, or it is not
@@ -104,7 +110,7 @@ def run_missing_jobs(record: BatchRecord, executor: Executor, console: Console, 
             f"interrupted with {done} of {total} runs done; repeat the command with --resume to run the others"
         )
     if failed:
-        raise InputError(f"{failed} of {total} runs failed; repeat the command with --resume to run them again")
+        raise InputError(f"{failed} of {total} runs failed; repeat the command with --resume to run them again{advice}")
 
 
 def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
@@ -131,7 +137,8 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                         print_line(progress.console, str(outcome))
                         for warning in outcome.warnings:
                             print_line(progress.console, f"warning: {warning}")
-                        progress.table = next(iter(record.screen_tables()), None)
+                        if console.is_terminal and (table := record.live_table()) is not None:
+                            show.show_table(table)
                         try:
                             record.write()
                         except OutputError as error:  # the running jobs can still finish

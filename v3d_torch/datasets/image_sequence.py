@@ -38,7 +38,7 @@ class ImageSequence(StoredSequence):
     @property
     def notes(self) -> list[str]:
         """Sentences about the sequence that a user needs to know, such as how the depth scale was estimated."""
-        return [] if self.depth_scale_note is None else [self.depth_scale_note]
+        return [*super().notes, *([] if self.depth_scale_note is None else [self.depth_scale_note])]
 
     def check(self, source: object, *, skip_broken: bool = False) -> None:
         """Check that all files exist, and decode the first frame, so that errors are reported before a long run.

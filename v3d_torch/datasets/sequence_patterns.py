@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -14,9 +15,39 @@ from v3d_torch.errors import InputError
 
 _WILDCARDS = "*?["
 
+_NAMED_FOLDERS = 3
+"""Number of folders that a note names; a pattern can match hundreds of others."""
 
-def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -> list[str]:
-    """List the sequences that match names, paths and patterns, in the form that `load_sequence` accepts.
+
+@dataclass(frozen=True)
+class Matches:
+    """What names, paths and patterns match.
+
+    Attributes:
+        sequences: Sequences, in the form that `load_sequence` accepts.
+        other_folders: Folders that are not a sequence, by the pattern that matches them, without hidden folders.
+    """
+
+    sequences: Sequence[str]
+    other_folders: Mapping[str, Sequence[str]]
+
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about the folders that are not a sequence: one of them may have been meant."""
+        notes = []
+        for pattern, folders in self.other_folders.items():
+            left_out = (
+                "1 folder is no sequence and is left out"
+                if len(folders) == 1
+                else f"{len(folders)} folders are no sequences and are left out"
+            )
+            named = ", ".join(folders[:_NAMED_FOLDERS]) + (" ..." if len(folders) > _NAMED_FOLDERS else "")
+            notes.append(f"{pattern}: {left_out}: {named}")
+        return notes
+
+
+def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -> Matches:
+    """Find the sequences that match names, paths and patterns.
 
     The wildcards are those of the shell, ``*``, ``?`` and ``[ ]``. A pattern is matched against
 
@@ -32,40 +63,58 @@ def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -
         data_root: Folder with the user's sequences; None for ``$V3D_DATA``, or else the cache.
 
     Returns:
-        Sequences in the order of the patterns, each once, in its first spelling. The matches of a pattern are ordered
-        as above: paths and entries of ``data_root`` alphabetically, benchmark names with those of the paper first.
+        Sequences in the order of the patterns, each once, in its first spelling, and the other folders that match. The
+        matches of a pattern are ordered as above: paths and entries of ``data_root`` alphabetically, benchmark names
+        with those of the paper first.
 
     Raises:
         InputError: If a pattern has no matches.
     """
-    found: dict[Path | str, str] = {}
+    root = data_folder(data_root)
+    sequences: dict[Path | str, str] = {}
+    other_folders: dict[str, list[str]] = {}
     for pattern in patterns:
         try:
-            for name in _match(pattern, data_folder(data_root)):
-                found.setdefault(identify(name, data_root), name)
+            names, folders = _match(pattern, root)
+            for name in names:
+                sequences.setdefault(identify(name, data_root), name)
         except (OSError, RuntimeError, ValueError) as error:  # name too long, unknown user after ~, ** within a name
             raise InputError(f"{pattern}: is not a valid pattern ({error}); check the path") from error
-    return list(found.values())
+        if folders:
+            other_folders[pattern] = folders
+    return Matches(list(sequences.values()), other_folders)
 
 
-def _match(pattern: str, root: Path) -> list[str]:
+def _match(pattern: str, root: Path) -> tuple[list[str], list[str]]:
+    """Return the sequences and the other folders that match a pattern."""
     path = Path(pattern).expanduser()
     if not any(wildcard in pattern for wildcard in _WILDCARDS) or path.exists():
-        return [pattern]
-    paths = [str(found) for found in _match_paths(Path(path.anchor), path)]
-    entries = [] if path.is_absolute() else [str(found.relative_to(root)) for found in _match_paths(root, path)]
-    names = [] if pattern[0] in _WILDCARDS else _match_names(pattern)
-    if found := [*paths, *entries, *names]:
-        return found
+        return [pattern], []
+    paths, folders = _match_paths(Path(path.anchor), path)
+    names = [*map(str, paths)]
+    other_folders = [*map(str, folders)]
+    if not path.is_absolute():
+        paths, folders = _match_paths(root, path)
+        names += [str(found.relative_to(root)) for found in paths]
+        other_folders += [str(found.relative_to(root)) for found in folders]
+    names += [] if pattern[0] in _WILDCARDS else _match_names(pattern)
+    if names:
+        return names, list(dict.fromkeys(other_folders))  # the root can be the current folder
     raise InputError(
         f"{pattern}: matches no sequence; searched for paths, in {root}, and for names of the TUM benchmark"
         " (fr3/w/xyz, fr1/desk ...)"
     )
 
 
-def _match_paths(root: Path, pattern: Path) -> list[Path]:
-    """Find the sequences below ``root`` whose relative paths match a pattern."""
-    return [found for found in sorted(root.glob(str(pattern.relative_to(pattern.anchor)))) if is_source(found)]
+def _match_paths(root: Path, pattern: Path) -> tuple[list[Path], list[Path]]:
+    """Find the sequences and the other folders below ``root`` whose relative paths match a pattern.
+
+    Other folders are returned only if there are sequences: else the pattern is meant for another root.
+    """
+    is_sequence = {path: is_source(path) for path in sorted(root.glob(str(pattern.relative_to(pattern.anchor))))}
+    sequences = [path for path, is_one in is_sequence.items() if is_one]
+    others = [path for path in is_sequence if not (is_sequence[path] or path.name.startswith(".")) and path.is_dir()]
+    return sequences, others if sequences else []
 
 
 def _match_names(pattern: str) -> list[str]:

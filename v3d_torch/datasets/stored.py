@@ -70,6 +70,12 @@ class StoredSequence(ABC):
         except InputError as error:
             self.groundtruth_error = error
 
+    @property
+    def notes(self) -> list[str]:
+        """Sentences about the sequence that a user needs to know before a run."""
+        error = self.groundtruth_error
+        return [] if error is None else [f"no ground truth, and so no scores: {error}"]
+
     def __len__(self) -> int:
         return self.stamps.shape[0]
 

@@ -13,7 +13,8 @@ from rich.table import Table
 
 from v3d_torch.config.loading import FULL
 from v3d_torch.evaluation import tables
-from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
+from v3d_torch.evaluation.outcome import Outcome, collect_metric, label_sequence
+from v3d_torch.evaluation.outcome_groups import OutcomeGroups
 from v3d_torch.evaluation.paper_tables import HEADINGS
 from v3d_torch.evaluation.summary import make_error_tables
 from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, format_markdown_table, format_median_and_range
@@ -102,8 +103,8 @@ def format_markdown(outcomes: Sequence[Outcome], note: str = "") -> str:
         note: Remark on how the runs were made.
     """
     lines = ["# Ablation", LEGEND, "", PAPER_RESULTS, "", *([note] if note else [])]
-    for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
-        runs = [outcome for outcome in outcomes if outcome.sequence == sequence]
+    groups = OutcomeGroups(outcomes)
+    for runs in map(groups.of_sequence, groups.sequences):
         seeds = f"Seeds: {len({run.seed for run in runs})}. {conclusion(runs)}"
         lines += format_markdown_table(_make_table(runs), "variant", seeds)
         lines += ["", *(f"- {run}" for run in runs if run.failure is not None)]
@@ -127,19 +128,19 @@ def make_overview_table(outcomes: Sequence[Outcome], absent: Sequence[str] = ())
     if not found:
         return None
     (ate,) = found
+    groups = OutcomeGroups(outcomes)
     paper = {variant: f"{PAPER_RATIOS[variant]:.2f}" for variant in ate.methods if variant in PAPER_RATIOS}
     ratios = {
-        _RATIO_ROW: tuple(Cell(_ratio_to_full(outcomes, variant), best=False) for variant in ate.methods),
+        _RATIO_ROW: tuple(Cell(_ratio_to_full(groups, variant), best=False) for variant in ate.methods),
         f"{_RATIO_ROW} (paper)": tuple(Cell(paper.get(variant, "-"), best=False) for variant in ate.methods),
     }
     return ErrorTable(f"Ablation: {ate.heading}", ate.methods, {**ate.rows, **ratios})
 
 
-def _ratio_to_full(outcomes: Sequence[Outcome], variant: str) -> str:
+def _ratio_to_full(groups: OutcomeGroups, variant: str) -> str:
     ratios = []
-    for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
-        measured = dict(_by_variant([run for run in outcomes if run.sequence == sequence], "ate.rmse"))
-        values, full = measured.get(variant), measured.get(FULL)
+    for sequence in groups.sequences:
+        values, full = (collect_metric(groups.of(sequence, config), "ate.rmse") for config in (variant, FULL))
         if values and full:
             ratios.append(median(values) / median(full))
     return f"{geometric_mean(ratios):.2f}" if ratios else "-"
@@ -195,7 +196,7 @@ def _make_table(outcomes: Sequence[Outcome]) -> ErrorTable:
         for variant, count in failed.items():
             rows[variant].append(Cell(str(count), best=False))
     sequence = outcomes[0].sequence
-    label = label_sequence(sequence, find_difference(outcomes, sequence))
+    label = label_sequence(sequence, OutcomeGroups(outcomes).find_difference(sequence))
     return ErrorTable(label, tuple(headings), {variant: tuple(cells) for variant, cells in rows.items()})
 
 

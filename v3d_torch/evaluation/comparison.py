@@ -8,13 +8,14 @@ over all sequences is that of the mean of the sequences: runs of one sequence ar
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy
 
-from v3d_torch.evaluation.outcome import Outcome, find_difference, label_sequence
+from v3d_torch.evaluation.outcome import Outcome, label_sequence
+from v3d_torch.evaluation.outcome_groups import OutcomeGroups
 from v3d_torch.evaluation.tables import Cell, ErrorTable
 
 CONFIDENCE = 0.95
@@ -75,19 +76,14 @@ def compare_configurations(outcomes: Sequence[Outcome], key: str, heading: str) 
     Returns:
         Table of ratios, significant ones marked as best or worse; None if there are too few runs for an interval.
     """
-    configs = list(dict.fromkeys(outcome.config for outcome in outcomes))
-    reference, others = configs[0] if configs else "", configs[1:]
-    errors = {
-        (run.sequence, run.config, run.seed): value
-        for run in outcomes
-        if run.failure is None and (value := run.get_metric(key))  # an error of 0 has no logarithm
-    }
+    groups = OutcomeGroups(outcomes)
+    reference, others = groups.configs[0] if groups.configs else "", groups.configs[1:]
     rows: dict[str, tuple[Cell, ...]] = {}
     means: Mapping[str, list[float]] = {config: [] for config in others}
-    for sequence in dict.fromkeys(outcome.sequence for outcome in outcomes):
-        difference, cells = find_difference(outcomes, sequence), []
+    for sequence in groups.sequences:
+        difference, cells = groups.find_difference(sequence), []
         for config in others:
-            pairs = _paired_ratios(errors, sequence, reference, config)
+            pairs = _paired_ratios(groups.of(sequence, config), groups.of(sequence, reference), key)
             cells.append(_cell(pairs))
             if pairs and difference is None:
                 means[config].append(mean_ratio(pairs).mean)
@@ -100,15 +96,18 @@ def compare_configurations(outcomes: Sequence[Outcome], key: str, heading: str) 
     return ErrorTable(f"{heading} relative to {reference}", tuple(others), rows)
 
 
-def _paired_ratios(
-    errors: Mapping[tuple[str, str, int], float], sequence: str, reference: str, config: str
-) -> list[float]:
+def _paired_ratios(runs: Iterable[Outcome], reference_runs: Iterable[Outcome], key: str) -> list[float]:
     """Ratios of the errors of a configuration to those of the reference with the same seed."""
-    return [
-        value / errors[sequence, reference, seed]
-        for (name, own, seed), value in errors.items()
-        if (name, own) == (sequence, config) and (sequence, reference, seed) in errors
-    ]
+    errors, reference_errors = (_errors_by_seed(each, key) for each in (runs, reference_runs))
+    return [value / reference_errors[seed] for seed, value in errors.items() if seed in reference_errors]
+
+
+def _errors_by_seed(runs: Iterable[Outcome], key: str) -> dict[int, float]:
+    return {
+        run.seed: value
+        for run in runs
+        if run.failure is None and (value := run.get_metric(key))  # an error of 0 has no logarithm
+    }
 
 
 def _cell(ratios: Sequence[float]) -> Cell:

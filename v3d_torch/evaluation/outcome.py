@@ -68,12 +68,6 @@ class Outcome:
         return f"{self.run}: {result}"
 
 
-def find_difference(outcomes: Iterable[Outcome], sequence: str) -> str | None:
-    """Return the difference of a sequence to that of the benchmark with its name; None if no run recorded one."""
-    differences = (outcome.difference for outcome in outcomes if outcome.sequence == sequence)
-    return next((difference for difference in differences if difference is not None), None)
-
-
 def label_sequence(sequence: str, difference: str | None) -> str:
     """Return the name of a sequence in tables, followed by its difference to the sequence of the benchmark, if any."""
     return printable(sequence if difference is None else f"{sequence} ({difference})")

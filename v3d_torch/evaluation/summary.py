@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import StringIO
 from statistics import median
@@ -12,7 +12,8 @@ from rich.console import RenderableType
 
 from v3d_torch.datasets.sequence_names import find_paper_sequence
 from v3d_torch.evaluation.comparison import compare_configurations
-from v3d_torch.evaluation.outcome import Outcome, collect_metric, find_difference, label_sequence
+from v3d_torch.evaluation.outcome import Outcome, collect_metric, label_sequence
+from v3d_torch.evaluation.outcome_groups import OutcomeGroups
 from v3d_torch.evaluation.paper_tables import HEADINGS, load_paper_scores
 from v3d_torch.evaluation.tables import (
     Cell,
@@ -59,12 +60,7 @@ def make_error_tables(
         papers: Methods of the paper to include, such as ``V3D-SLAM``; None for all.
         absent: Sequences of the paper that are not available; they have a row without values.
     """
-    tables = []
-    for metric, heading in HEADINGS.items():
-        results = _results(outcomes, metric, papers, absent)
-        if any(result.seeds and result.values for result in results):
-            tables.append(_table(heading, results))
-    return tables
+    return list(_error_tables(outcomes, papers, absent))
 
 
 def make_ratio_tables(outcomes: Sequence[Outcome]) -> list[ErrorTable]:
@@ -109,8 +105,9 @@ def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     writer.writerow(
         ["metric", "sequence", "method", "median", "lowest", "highest", "seeds", "failed", "sd", "difference"]
     )
+    groups = OutcomeGroups(outcomes)
     for metric, key in METRIC_KEYS.items():
-        for result in _results(outcomes, metric, None, absent):
+        for result in _results(groups, metric, None, absent):
             values = result.values
             summary = [median(values), min(values), max(values)] if values else [None] * 3
             counts = [result.seeds, result.failed] if result.seeds else [None] * 2
@@ -120,15 +117,19 @@ def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     return text.getvalue()
 
 
+def make_live_table(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTable | None:
+    """Return the first table of `make_screen_tables`, to be shown while runs go on; None if nothing was measured."""
+    return next(_screen_error_tables(outcomes, absent), None)
+
+
 def make_screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[RenderableType]:
     """Return the tables for the screen, with the first and the last method of the paper, and their explanations.
 
     See `make_error_tables` and `make_ratio_tables`.
     """
     shown: list[RenderableType] = []
-    if errors := make_error_tables(outcomes, _SCREEN_METHODS, absent):
-        shown += [make_screen_table(replace(table, heading=f"{table.heading}, RMSE")) for table in errors]
-        shown.append(make_screen_legend(LEGEND))
+    if errors := list(_screen_error_tables(outcomes, absent)):
+        shown += [*map(make_screen_table, errors), make_screen_legend(LEGEND)]
     if ratios := make_ratio_tables(outcomes):
         shown += [*map(make_screen_table, ratios), make_screen_legend(f"{RATIO_LEGEND} {_RATIO_COLOURS}")]
     return shown
@@ -167,16 +168,29 @@ class _Result:
         return format_median_and_range(self.values, _FORMAT) + (f", {self.failed} failed" if self.failed else "")
 
 
-def _results(
-    outcomes: Sequence[Outcome], metric: str, papers: Sequence[str] | None, absent: Sequence[str]
-) -> list[_Result]:
+def _error_tables(
+    outcomes: Sequence[Outcome], papers: Sequence[str] | None, absent: Sequence[str]
+) -> Iterator[ErrorTable]:
+    """Yield the tables of `make_error_tables`, each made when it is requested."""
+    groups = OutcomeGroups(outcomes)
+    for metric, heading in HEADINGS.items():
+        results = _results(groups, metric, papers, absent)
+        if any(result.seeds and result.values for result in results):
+            yield _table(heading, results)
+
+
+def _screen_error_tables(outcomes: Sequence[Outcome], absent: Sequence[str]) -> Iterator[ErrorTable]:
+    for table in _error_tables(outcomes, _SCREEN_METHODS, absent):
+        yield replace(table, heading=f"{table.heading}, RMSE")
+
+
+def _results(groups: OutcomeGroups, metric: str, papers: Sequence[str] | None, absent: Sequence[str]) -> list[_Result]:
     """Collect the results by sequence, then configurations in the order of the runs, then the paper's methods."""
     results = []
-    configs = dict.fromkeys(outcome.config for outcome in outcomes)
-    for sequence in _order_sequences([outcome.sequence for outcome in outcomes], absent):
-        difference = find_difference(outcomes, sequence)
-        for config in configs:
-            runs = [run for run in outcomes if (run.sequence, run.config) == (sequence, config)]
+    for sequence in _order_sequences(groups.sequences, absent):
+        difference = groups.find_difference(sequence)
+        for config in groups.configs:
+            runs = groups.of(sequence, config)
             failed = sum(run.failure is not None for run in runs)
             values = collect_metric(runs, METRIC_KEYS[metric])
             deviations = collect_metric(runs, METRIC_KEYS[metric].replace("rmse", "std"))
@@ -192,17 +206,19 @@ def _results(
 
 
 def _order_sequences(sequences: Sequence[str], absent: Sequence[str]) -> list[str]:
-    """Return each sequence once, in the given order; in the paper's order if some of its sequences are absent."""
+    """Return the sequences in the given order; in the paper's order if some of its sequences are absent."""
     if not absent:
-        return list(dict.fromkeys(sequences))
+        return list(sequences)
     return [sequence for sequence in load_paper_scores()["ate"] if sequence in {*sequences, *absent}]
 
 
 def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:
     methods = tuple(dict.fromkeys(result.method for result in results))
+    by_sequence: dict[str, dict[str, _Result]] = {}
+    for result in results:
+        by_sequence.setdefault(result.sequence, {})[result.method] = result
     rows = {}
-    for sequence in dict.fromkeys(result.sequence for result in results):
-        by_method = {result.method: result for result in results if result.sequence == sequence}
+    for sequence, by_method in by_sequence.items():
         medians = {method: median(result.values) for method, result in by_method.items() if result.values}
         difference = next((result.difference for result in by_method.values() if result.difference is not None), None)
         # A part of a sequence, or another recording, is not comparable with the whole, so no value is the best.

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from statistics import median
 from typing import NamedTuple
 
@@ -65,6 +66,16 @@ class ErrorTable:
     heading: str
     methods: tuple[str, ...]
     rows: Mapping[str, tuple[Cell, ...]]
+
+
+def select_last_rows(table: ErrorTable, count: int) -> ErrorTable:
+    """Return the last rows of a table; the first row then tells how many others there are."""
+    omitted = len(table.rows) - count
+    if omitted <= 0:
+        return table
+    blank = Cell("", best=False)
+    first = {f"... {omitted} more": (blank,) * len(table.methods)}
+    return replace(table, rows=first | dict(islice(table.rows.items(), omitted, None)))
 
 
 def format_median_and_range(values: Sequence[float], form: str) -> str:

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from v3d_torch.mapping.map_tables import MapTables
 
-_MAX_LANDMARKS_PER_OBSERVATION = 2
-"""Ratio of landmarks to observations above which the table is compacted. Every active landmark has at least one
-observation, so above this ratio more than half of the landmarks are inactive."""
+_COMPACTION_RATIO = 2
+"""Ratio of all landmarks to the landmarks in use above which the table is compacted."""
 
 
 def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
@@ -59,7 +58,7 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
 
 
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:
-    """Remove inactive, unreferenced landmarks from the table, if most of its rows are unused.
+    """Remove the landmarks that are not in use from the table, if these are most of its rows.
 
     Memory and time then depend on the current size of the map, not on its history. The other landmarks get new IDs in
     the order of the old ones; nothing else changes.
@@ -68,18 +67,45 @@ def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None
         tables: Data of the map.
         external_ids: Landmark IDs stored outside of the map, -1 for none, int64; updated in place.
     """
-    if len(tables.landmarks) <= _MAX_LANDMARKS_PER_OBSERVATION * len(tables.observations):
+    external_ids = list(external_ids)
+    in_use = find_landmarks_in_use(tables, external_ids)
+    if len(in_use) <= _COMPACTION_RATIO * int(in_use.sum()):
         return
-    tensors = [
-        tables.observations["landmark"],
-        *(keyframe.landmarks for keyframe in tables.keyframes),
-        *external_ids,
-    ]
+    tensors = [*_stored_ids(tables), *external_ids]
     distinct = {tensor.data_ptr(): tensor for tensor in tensors if len(tensor)}.values()  # tensors can share memory
-    needed = tables.landmarks["active"].clone()
+    tables.landmarks.keep_rows(in_use)
+    new_id = compacted_ids(in_use)
     for ids in distinct:
-        needed[ids[ids >= 0]] = True
-    tables.landmarks.keep_rows(needed)
-    new_id = needed.cumsum(0) - 1
-    for ids in distinct:
-        ids.copy_(torch.where(ids >= 0, new_id[ids], -1))
+        ids.copy_(new_id[ids])
+
+
+def find_landmarks_in_use(tables: MapTables, external_ids: Iterable[Tensor] = ()) -> Tensor:
+    """Find the landmarks that are active or that an observation, a keyframe or another ID refers to.
+
+    Args:
+        tables: Data of the map.
+        external_ids: Landmark IDs stored outside of the map, -1 for none, int64.
+
+    Returns:
+        Mask of the landmarks, bool, shape :math:`(L,)`.
+    """
+    ids = torch.cat([*_stored_ids(tables), *external_ids])
+    in_use = tables.landmarks["active"].clone()
+    in_use[ids[ids >= 0]] = True
+    return in_use
+
+
+def compacted_ids(in_use: Tensor) -> Tensor:
+    """Return the new ID of each landmark if only those in use remain, int64, shape :math:`(L + 1,)`.
+
+    The last element is -1, so that the ID of no landmark, -1, selects itself.
+
+    Args:
+        in_use: Mask of the landmarks, bool, shape :math:`(L,)`.
+    """
+    return torch.cat([in_use.cumsum(0) - 1, torch.tensor([-1])])
+
+
+def _stored_ids(tables: MapTables) -> list[Tensor]:
+    """Landmark IDs stored in the map, -1 for none."""
+    return [tables.observations["landmark"], *(keyframe.landmarks for keyframe in tables.keyframes)]

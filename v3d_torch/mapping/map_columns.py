@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from v3d_torch.features.features import Features
+from v3d_torch.features.scale_pyramid import octaves_of_levels
+from v3d_torch.geometry.se3 import orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.mapping.landmark_ids import compacted_ids, find_landmarks_in_use
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticView, StaticViews
@@ -24,15 +27,22 @@ OPTIONAL_COLUMNS = ("feature/sigma_ratio", "observation/sigma_ratio")
 _MIN_SIGMA_RATIO = torch.finfo(torch.float64).tiny
 """Smallest positive number: standard deviations are not zero."""
 
+_MOTION_TOLERANCE = 1e-6
+"""Maximum difference of an element of a rigid motion from the nearest exact one."""
+
 
 def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
     """Convert a map and its views to columns. An empty map gives empty columns of the right type and shape.
+
+    Landmarks that are not in use are left out; the IDs of the others are their rows in the columns.
 
     Args:
         tables: Data of the map.
         views: Static views of its keyframes.
     """
     keyframes, features = _empty_tables()
+    in_use = find_landmarks_in_use(tables)
+    new_id = compacted_ids(in_use)
     for keyframe in tables.keyframes:
         keyframes.append(
             stamp=torch.tensor([keyframe.stamp], dtype=torch.float64),
@@ -41,15 +51,15 @@ def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
             reference=torch.tensor([keyframe.reference]),
             feature_count=torch.tensor([len(keyframe.features)]),
         )
-        features.append(**vars(keyframe.features), landmark=keyframe.landmarks)
+        features.append(**vars(keyframe.features), landmark=new_id[keyframe.landmarks])
     loops, size = tables.loops, (views.camera.height, views.camera.width)
     depth_units = [torch.zeros(0, *size, dtype=torch.uint16), *(view.depth_units[None] for view in views)]
     colours = [torch.zeros(0, 3, *size, dtype=torch.uint8), *(view.colour[None] for view in views)]
     groups = {
         "keyframe": keyframes.columns,
         "feature": features.columns,
-        "landmark": tables.landmarks.columns,
-        "observation": tables.observations.columns,
+        "landmark": {name: column[in_use] for name, column in tables.landmarks.columns.items()},
+        "observation": tables.observations.columns | {"landmark": new_id[tables.observations["landmark"]]},
         "loop": {
             "i": torch.tensor([loop.i for loop in loops], dtype=torch.int64),
             "j": torch.tensor([loop.j for loop in loops], dtype=torch.int64),
@@ -121,16 +131,19 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
     if int(counts.sum()) != lengths["feature"]:
         return "keyframe/feature_count does not add up to the number of features"
     camera, keyframes, landmarks = sparse_map.camera, lengths["keyframe"], lengths["landmark"]
+    end_octave = octaves_of_levels(sparse_map.features_config, camera.width).stop
     for name, minimum, end in (
         ("keyframe/part", 0, keyframes),
         ("keyframe/feature_count", 0, lengths["feature"] + 1),
         ("keyframe/reference", 0, keyframes),
         ("feature/pixel", 0, torch.tensor([camera.width, camera.height])),
+        ("feature/octave", 0, end_octave),
         ("feature/landmark", -1, landmarks),
         ("landmark/keyframe", 0, keyframes),
         ("observation/landmark", 0, landmarks),
         ("observation/keyframe", 0, keyframes),
         ("observation/feature", 0, counts[owners.clamp(0, keyframes - 1)] if keyframes else 0),
+        ("observation/octave", 0, end_octave),
         ("feature/sigma_ratio", _MIN_SIGMA_RATIO, torch.inf),
         ("observation/sigma_ratio", _MIN_SIGMA_RATIO, torch.inf),
         ("loop/i", 0, keyframes),
@@ -139,8 +152,17 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
     ):
         if not bool(((columns[name] >= minimum) & (columns[name] < end)).all()):
             return f"{name} has values out of range"
+    for name in ("keyframe/T_cw", "loop/T_ij"):
+        if not _are_rigid_motions(columns[name]):
+            return f"{name} has matrices that are not rigid motions"
     reference = columns["keyframe/reference"]
     return None if torch.equal(reference[reference], reference) else "keyframe/reference refers to a culled keyframe"
+
+
+def _are_rigid_motions(T: Tensor) -> bool:
+    """Check whether matrices are rigid motions, up to rounding, float64, shape (N, 4, 4)."""
+    is_near = (T - orthonormalise(T)).abs() <= _MOTION_TOLERANCE  # false for NaN, of a singular matrix
+    return bool(is_near.all() and (torch.linalg.det(T) > 0).all())
 
 
 def _empty_tables() -> tuple[TensorTable, TensorTable]:

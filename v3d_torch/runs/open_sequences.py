@@ -8,7 +8,6 @@ from pathlib import Path
 from rich.console import Console
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
-from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.runs.print_line import print_line
@@ -22,17 +21,21 @@ _BYTES_PER_PIXEL = 500
 
 
 def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
-    """Open a sequence as `load_sequence` does, with a progress bar for downloads."""
-    with progress_bars(console) as progress:
-        bar = ProgressBar(progress, "sequence")
-        sequence = load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)
+    """Open a sequence as `load_sequence` does, with a progress bar for downloads, and print notes on it."""
+    sequence = _load(name, data_root, console, skip_broken=skip_broken)
     print_notes(sequence, console)
     return sequence
 
 
+def _load(name: str, data_root: Path | None, console: Console, *, skip_broken: bool) -> RGBDSequence:
+    with progress_bars(console) as progress:
+        bar = ProgressBar(progress, "sequence")
+        return load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)
+
+
 def print_notes(source: RGBDStream, console: Console) -> None:
     """Print notes on a source: those of the sequence, and the memory of a run with large images."""
-    notes = source.notes if isinstance(source, ImageSequence) else []
+    notes = source.notes if isinstance(source, StoredSequence) else []
     width, height = source.camera.width, source.camera.height
     if width * height > _MANY_PIXELS:
         gigabytes = width * height * _BYTES_PER_PIXEL / 1e9
@@ -59,19 +62,34 @@ def open_sequences(
 ) -> dict[str, RGBDSequence]:
     """Open several sequences in the given order, before the first of them is run; see `load_sequence`.
 
+    All sequences are opened before an error is raised. If several are not valid, a line is printed for each.
+
     Returns:
         Sequences by their name in tables.
 
     Raises:
-        InputError: If a sequence is not valid, or two sequences have the same name.
+        InputError: If sequences are not valid, or two sequences have the same name.
         DownloadError: If a sequence is missing and cannot be downloaded.
     """
     sequences: dict[str, RGBDSequence] = {}
     sources: dict[str, str] = {}
-    for name in dict.fromkeys(names):
-        sequence = open_sequence(name, data_root, console, skip_broken=skip_broken)
-        check_groundtruth(sequence)  # runs are compared by their scores
-        if (other := sources.setdefault(sequence.name, name)) != name:
-            raise InputError(f"{name}: {other} has the same name, {sequence.name}; run them separately")
-        sequences[sequence.name] = sequence
+    errors: list[InputError] = []
+    names = list(dict.fromkeys(names))
+    for name in names:
+        try:
+            sequence = _load(name, data_root, console, skip_broken=skip_broken)
+            check_groundtruth(sequence)  # runs are compared by their scores
+            print_notes(sequence, console)
+            if (other := sources.setdefault(sequence.name, name)) != name:
+                raise InputError(f"{name}: {other} has the same name, {sequence.name}; run them separately")
+            sequences[sequence.name] = sequence
+        except InputError as error:
+            errors.append(error)
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        console.print("not valid:")
+        for invalid in errors:
+            print_line(console, str(invalid))
+        raise InputError(f"{len(errors)} of {len(names)} sequences are not valid, the first: {errors[0]}")
     return sequences

@@ -13,6 +13,9 @@ from v3d_torch.frame_result import FrameResult
 from v3d_torch.runs.run import describe_motion
 from v3d_torch.types import RGBDFrame
 
+_REFRESHES_PER_SECOND = 2
+"""Rate at which bars are drawn: drawing takes processor time from the runs."""
+
 
 class ProgressBars(Progress):
     """Progress bars above an optional table.
@@ -39,6 +42,7 @@ def progress_bars(console: Console) -> ProgressBars:
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}"),
         console=console,
+        refresh_per_second=_REFRESHES_PER_SECOND,
         disable=not console.is_terminal,
     )
 

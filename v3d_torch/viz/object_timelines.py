@@ -144,4 +144,5 @@ def _draw_scale(
     colours = colormaps["viridis"].with_extremes(under=(0.5, 0.5, 0.5, 0.2))
     edges, cells = frame_cells(seconds, grid)
     mesh = axes.pcolormesh(edges, np.arange(len(grid) + 1), cells, cmap=colours, vmin=vmin, vmax=vmax, rasterized=True)
-    axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=12, ticks=MaxNLocator(4, integer=integer))
+    ticks = MaxNLocator(4, integer=integer, min_n_ticks=1)  # one vote is a scale with one whole number
+    axes.figure.colorbar(mesh, ax=axes, pad=0.01, aspect=12, ticks=ticks)
