@@ -90,6 +90,8 @@ def _match(pattern: str, root: Path) -> tuple[list[str], list[str]]:
     path = Path(pattern).expanduser()
     if not any(wildcard in pattern for wildcard in _WILDCARDS) or path.exists():
         return [pattern], []
+    if any("**" in part and part != "**" for part in path.parts):  # from Python 3.13 on, ** then means *
+        raise ValueError("** stands for whole folders only")
     paths, folders = _match_paths(Path(path.anchor), path)
     names = [*map(str, paths)]
     other_folders = [*map(str, folders)]

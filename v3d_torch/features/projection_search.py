@@ -139,7 +139,8 @@ def _pairs_within(
 
 def _cells(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
     """Grid cells (column, row) of pixels relative to the grid's origin, both (2, N)."""
-    return np.floor(pixels / _CELL).astype(np.int64)
+    with np.errstate(invalid="ignore"):  # nothing is near a pixel that is NaN, whatever its cell
+        return np.floor(pixels / _CELL).astype(np.int64)
 
 
 def _expand_ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -62,14 +62,12 @@ def kernel(signature: str) -> Callable[[_F], _F]:
 
         njit: Any = numba.njit  # its type lacks some options
         settings = vars(numba.config)
-        # numba before 0.62 does not know the second setting, and uses a subfolder of the first for each source folder.
-        changes = {"CACHE_DIR": str(_code_folder()), "CACHE_LOCATOR_CLASSES": f"{__name__}.{CodeLocator.__name__}"}
-        before = {name: settings.get(name, "") for name in changes}
-        settings.update(changes)
+        before = settings["CACHE_LOCATOR_CLASSES"]
+        settings["CACHE_LOCATOR_CLASSES"] = f"{__name__}.{CodeLocator.__name__}"
         try:
             compiled = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
         finally:
-            settings.update(before)
+            settings["CACHE_LOCATOR_CLASSES"] = before
         _TO_COMPILE.append((compiled, signature))
         return cast("_F", compiled)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -99,7 +100,7 @@ def test_quaternions_of_a_path_are_computed_together(monkeypatch: pytest.MonkeyP
         shapes.append(matrix.shape)
         return from_matrix(matrix)
 
-    monkeypatch.setattr(Rotation, "from_matrix", recorded)
+    monkeypatch.setattr("v3d_torch.export.ros.messages.Rotation", SimpleNamespace(from_matrix=recorded))
     assert [each.pose for each in path(2.5, "map", [1.0] * 50, many).poses] == expected
     assert shapes == [(50, 3, 3)]
 
