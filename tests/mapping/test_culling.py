@@ -131,6 +131,15 @@ def test_culling_a_keyframe_removes_its_observations_and_its_own_landmarks_only(
         assert torch.equal(landmarks, keyframe.landmarks)
 
 
+def test_landmark_that_only_a_culled_keyframe_still_observes_becomes_inactive() -> None:
+    """Bundle adjustment has removed its observations by the other keyframes as outliers."""
+    sparse_map = make_map([ALL, ALL])
+    rows = (sparse_map.observations["landmark"] == 3) & (sparse_map.observations["keyframe"] != 1)
+    sparse_map.remove_observations(torch.nonzero(rows)[:, 0])
+    cull_keyframes(sparse_map, {1: 2})
+    assert torch.nonzero(~sparse_map.landmarks["active"]).tolist() == [[3]]
+
+
 def test_culled_keyframes_and_their_landmarks_move_with_the_reference_keyframe() -> None:
     """Also if the reference keyframe is culled later: 1 moves with 2, then 2 with 4."""
     sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(4)], moving=True)
@@ -200,13 +209,13 @@ def test_landmark_that_a_quarter_of_the_frames_match_is_not_culled() -> None:
 def test_landmarks_without_a_second_observation_are_culled_after_three_keyframes() -> None:
     sparse_map = make_empty_map()
     sparse_map.insert_keyframe(0, 0.0, EYE, random_features(3), torch.full((3,), -1))
-    for _ in range(2):
-        insert(sparse_map, {1: 0})
+    for observed in ({1: 0, 2: 0}, {1: 0}):
+        insert(sparse_map, observed)
         cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"].all()
     insert(sparse_map, {})
     cull_landmarks(sparse_map)
-    assert sparse_map.landmarks["active"].tolist() == [False, True, False]
+    assert sparse_map.landmarks["active"].tolist() == [False, True, True]
     sparse_map.remove_observations(torch.nonzero(sparse_map.observations["keyframe"] > 0)[:, 0])
     insert(sparse_map, {})
     cull_landmarks(sparse_map)
