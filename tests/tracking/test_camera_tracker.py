@@ -54,6 +54,18 @@ def test_camera_is_relocalised_if_its_pose_does_not_continue_one_in_the_map(prev
     assert missed.status is (LOST if previous in (DISCONNECTED, LOST) else ODOMETRY) and not missed.is_relocalised
 
 
+def test_tracked_frame_counts_which_landmarks_it_found_of_those_in_view() -> None:
+    """Landmarks that few frames find are culled."""
+    sparse_map, unmatched = make_map(), torch.full((20,), -1)
+    keyframe = sparse_map.insert_keyframe(0, 0.0, EYE, features(20), unmatched)
+    found = MapTracking(EYE, keyframe.landmarks.where(torch.arange(20) < 5, -1), keyframe.landmarks, EYE)
+    tracker = CameraTracker(lambda *args: found, SimpleNamespace(relocalise=None), sparse_map, 5)  # type: ignore[arg-type]
+    motion = CameraMotion(EYE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), True)
+    tracker(features(20), torch.zeros(1, 480, 640), EYE, unmatched, motion, Camera().poses)
+    assert sparse_map.landmarks["found"].tolist() == [2] * 5 + [1] * 15
+    assert sparse_map.landmarks["visible"].tolist() == [2] * 20
+
+
 def test_frame_without_landmarks_does_not_move_with_another_part_of_the_map() -> None:
     """A camera that started part 1 is found again in part 0; then tracking fails, and a loop moves part 1."""
     sparse_map, unmatched = make_map(), torch.full((20,), -1)
