@@ -159,6 +159,42 @@ def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
         assert np.array_equal(image, np.where(square(Wall()[0]).masks[0].numpy(), 255, 0))
 
 
+class DelayedWall(Wall):
+    """The wall, whose depth images are taken 10 ms after the colour images."""
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        return replace(super().__getitem__(index), depth_delay=0.01)
+
+
+def test_maps_leave_out_more_pixels_than_tracking_in_mask_images_and_views(tmp_path: Path) -> None:
+    """Maps have a larger margin around people. The views also have the delay of their depth."""
+    results: dict[float, FrameResult] = {}
+    slam = V3DSLAM(CAMERA, square, load_config(overrides=["mapping.max_keyframe_interval=5"]))
+    pipeline = Pipeline(DelayedWall(), slam, tmp_path / "masks", map_masks=tmp_path / "map_masks")
+    pipeline(lambda frame, result: results.update({frame.stamp: result}))
+    assert len(results) == FRAMES and len(pipeline.views) > 1
+    for stamp, result in results.items():
+        assert bool((result.static_mask & ~result.static_without_people).any())
+        for folder, static in (("masks", result.static_mask), ("map_masks", result.static_without_people)):
+            image = cv2.imread(str(tmp_path / folder / f"{stamp:.6f}.png"), cv2.IMREAD_UNCHANGED)
+            assert np.array_equal(image == 0, static.numpy())
+    for view in pipeline.views:
+        static = results[view.keyframe.stamp].static_without_people
+        assert torch.equal(view.depth > 0, static[:: pipeline.views.stride, :: pipeline.views.stride])
+        assert view.depth_delay == 0.01
+
+
+def test_occupancy_map_is_corrected_with_the_final_poses() -> None:
+    pipeline = run_along_wall("occupancy.enabled=true")
+    slam, further = pipeline.slam, torch.eye(4, dtype=torch.float64)
+    slam.flush()
+    further[2, 3] = -1.0
+    slam.map.move_keyframes(slam.map.T_cw @ further)
+    pipeline.flush()
+    assert slam.occupancy is not None
+    assert (slam.occupancy.map.occupied_points[:, 2] - (WALL + 1)).abs().max() < 0.1
+
+
 def test_masks_that_cannot_be_written_end_the_run_with_a_message(tmp_path: Path) -> None:
     (tmp_path / "masks").write_text("")
     failure = make_pipeline(masks=tmp_path / "masks")().failure
