@@ -22,6 +22,7 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.errors import InputError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
@@ -70,6 +71,21 @@ def test_time_of_the_run_does_not_contain_the_comparison_with_true_masks() -> No
     record = make_pipeline(MaskedWall())()
     assert record.mask_evaluation.compute_scores() is not None
     assert 0 < record.seconds < time.perf_counter() - begin - 0.05 * FRAMES
+
+
+def test_true_masks_are_not_read_after_the_first_that_cannot_be_read() -> None:
+    """The scores are then not those of the whole sequence, and the first error is reported."""
+    asked: list[int] = []
+
+    class DamagedMasks(Wall):
+        def motion_mask(self, index: int) -> Tensor:
+            asked.append(index)
+            if index >= 2:
+                raise InputError(f"mask {index}: is damaged")
+            return torch.zeros(240, 320, dtype=torch.uint8)
+
+    record = make_pipeline(DamagedMasks())()
+    assert asked == [0, 1, 2] and record.mask_error == "mask 2: is damaged" and record.failure is None
 
 
 def test_snapshots_of_a_stream_that_drops_frames_reach_from_its_first_to_its_last_frames() -> None:
