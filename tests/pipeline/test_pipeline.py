@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import walls
+from helpers.moving_camera import keyframe
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
 from helpers.walls import Slide
 from torch import Tensor
@@ -24,6 +25,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.errors import InputError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
@@ -236,6 +238,26 @@ def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
     assert checked == ([] if live else [1])
     pipeline.flush()
     assert checked == ([len(pipeline.slam.poses)] if live else [1])
+
+
+def test_camera_is_checked_when_its_own_run_has_enough_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views of a known map can be of another camera, and say nothing about this one."""
+    checked: list[int] = []
+    slam = V3DSLAM(CAMERA, square, load_config(overrides=["mapping.max_keyframe_interval=5"]))
+    views = StaticViews(CAMERA, slam.config.dense_map.stride)
+    for _ in range(3):
+        earlier = replace(keyframe(), frame=-1)
+        views.add(earlier, Wall()[0].image, Wall()[0].depth, torch.ones(240, 320, dtype=torch.bool))
+    pipeline = Pipeline(Wall(), slam, views=views)
+
+    def check(*_: object) -> list[str]:
+        checked.append(len(pipeline.slam.poses))
+        return []
+
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline.check_plausibility", check)
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline._CHECKED_KEYFRAMES", 2)
+    pipeline()
+    assert checked == [6]  # frames 0 and 5 became keyframes
 
 
 class Jump:
