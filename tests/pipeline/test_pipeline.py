@@ -22,7 +22,9 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.readable_frames import BrokenFrame
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.datasets.stored import max_broken_frames
 from v3d_torch.errors import InputError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.mapping.static_views import StaticViews
@@ -159,6 +161,25 @@ def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> N
     pipeline.flush()
     write_results(tmp_path, pipeline)
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
+
+
+class DamagedWall(Wall):
+    """The wall as an `RGBDSequence`, in which frame 3 is broken."""
+
+    def __init__(self) -> None:
+        super().__init__(broken=3)
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return map(self.__getitem__, range(FRAMES))
+
+
+def test_broken_frames_before_a_run_was_resumed_count_towards_the_limit() -> None:
+    broken = [BrokenFrame(0, "is damaged")] * max_broken_frames(FRAMES)
+    for earlier, failed in ((broken[1:], False), (broken, True)):
+        pipeline = Pipeline(DamagedWall(), V3DSLAM(CAMERA, square), skip_broken=True)
+        pipeline.record.broken = list(earlier)
+        failure = pipeline().failure
+        assert (failure is not None and "--skip-broken skips at most" in failure) is failed
 
 
 def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
