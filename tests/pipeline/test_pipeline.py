@@ -77,6 +77,27 @@ def test_time_of_the_run_does_not_contain_the_comparison_with_true_masks() -> No
     assert 0 < record.seconds < time.perf_counter() - begin - 0.05 * FRAMES
 
 
+def test_time_of_a_resumed_run_contains_that_before() -> None:
+    """Also in its checkpoints, which are saved after a frame."""
+    pipeline, seconds = make_pipeline(), list[float]()
+    pipeline.record.seconds = 100.0
+    record = pipeline(lambda *_: seconds.append(pipeline.record.seconds))
+    assert len(seconds) == FRAMES and sorted([100.0, *seconds, record.seconds]) == [100.0, *seconds, record.seconds]
+
+
+def test_run_whose_frame_failed_is_not_between_frames() -> None:
+    """No checkpoint can be saved, because the frame may have changed a part of the state."""
+    pipeline = make_pipeline()
+
+    def fail(*_: object) -> None:
+        if len(pipeline.slam.poses) == 4:
+            raise ZeroDivisionError
+
+    with pipeline.slam.register_stage_hook("odometry", fail):
+        assert "ZeroDivisionError" in str(pipeline().failure)
+    assert len(pipeline.slam.poses) == 4 and not pipeline.between_frames
+
+
 def test_true_masks_are_not_read_after_the_first_that_cannot_be_read() -> None:
     """The scores are then not those of the whole sequence, and the first error is reported."""
     asked: list[int] = []
