@@ -196,6 +196,39 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
     assert mesh["face"].count > 1000 and mesh["vertex"]["red"].std() > 10
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_mesh_leaves_out_a_part_of_the_map_whose_place_is_a_guess(
+    run: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.flush()
+    monkeypatch.setattr(run.slam, "config", load_config(overrides=["dense_map.mesh.enabled=true"]))
+    ends = []
+    for part in (0, 1):
+        monkeypatch.setattr(run.slam.map.keyframes[-1], "part", part)
+        write_results(tmp_path, run)
+        ends.append(float(plyfile.PlyData.read(tmp_path / "mesh.ply")["vertex"]["x"].max()))
+    assert ends[1] < ends[0] - 0.1  # the last keyframe is at the right end of the wall
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_keyframe_of_an_earlier_run_is_none_of_this_run_even_at_the_same_time(
+    run: Pipeline, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when a recording is run again in its own map."""
+    count, second = len(run.slam.map.keyframes), run.slam.map.keyframes[1]
+    monkeypatch.setattr(second, "frame", -1)
+    write_results(tmp_path, run)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["keyframes"], metrics["known_keyframes"]) == (count - 1, 1)
+    frames = pq.read_table(tmp_path / "frames.parquet").to_pandas()
+    stamps = frames["stamp"][frames["keyframe"]].tolist()
+    assert stamps == read_trajectory(tmp_path / "keyframes.txt").stamps.tolist()
+    assert len(stamps) == count - 1 and second.stamp not in stamps
+    green = [plyfile.PlyData.read(folder / "trajectory.ply")["vertex"]["green"] for folder in (results, tmp_path)]
+    changed = np.flatnonzero(green[0] != green[1])  # its frustum no longer has the colour of its time
+    assert changed.tolist() == list(range(FRAMES + 6, FRAMES + 12))
+
+
 def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:
     assert not {"occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml"} & {path.name for path in results.iterdir()}
     run = run_along_wall("occupancy.enabled=true")
