@@ -12,6 +12,7 @@ from typing import cast
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers import walls
@@ -217,6 +218,22 @@ def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert image.dtype == np.uint8
         assert np.array_equal(image, np.where(square(Wall()[0]).masks[0].numpy(), 255, 0))
+
+
+def test_frame_that_is_interrupted_after_its_pose_was_stored_has_no_row_in_the_tables(tmp_path: Path) -> None:
+    pipeline = make_pipeline()
+
+    def interrupt(*_: object) -> None:
+        if len(pipeline.slam.poses) == 5:
+            raise KeyboardInterrupt
+
+    with pipeline.slam.register_stage_hook("estimate_state", interrupt):
+        pipeline()
+    assert len(pipeline.slam.poses) == 5
+    pipeline.flush()
+    write_results(tmp_path, pipeline)
+    for name in ("frames", "states", "dynamics"):
+        assert len(pq.read_table(tmp_path / f"{name}.parquet")) == 4, name
 
 
 class DelayedWall(Wall):

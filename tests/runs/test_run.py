@@ -17,6 +17,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.report_page import render_page
@@ -91,6 +92,19 @@ def test_run_that_never_finds_the_camera_stores_the_cause_and_no_scores(
     page = render_page(read_run(tmp_path))
     assert all(text.count(cause) == 1 for text in (metrics["diagnosis"], caplog.text, page))
     assert "ATE RMSE" not in page and "The camera was not found in any frame" in page
+
+
+def test_run_that_ended_early_has_no_diagnosis(tmp_path: Path) -> None:
+    """The frames that it lacks could be different."""
+
+    def interrupt(frame: RGBDFrame, result: FrameResult) -> None:
+        if frame.index == 3:
+            raise KeyboardInterrupt
+
+    run = Run(RunRequest("wall", Config()), WallWithoutDepth(), square, tmp_path)
+    run(interrupt)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["failure"] == f"interrupted after 4 of {FRAMES} frames" and metrics["diagnosis"] is None
 
 
 class StoredWall(Wall):
