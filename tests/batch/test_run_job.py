@@ -37,6 +37,8 @@ def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tm
     progress = []
     assert run_job(moved, progress.append) is None
     assert progress == [5, 6, 7, 8]
+    log = (first.folder / RunFile.LOG).read_text()
+    assert all(f"frame {index} at" in log for index in range(8))
 
 
 def test_interrupted_job_continues_with_another_number_of_threads(moment: Path, tmp_path: Path) -> None:

@@ -197,6 +197,13 @@ def test_at_most_every_second_tracked_frame_is_segmented_while_frames_are_droppe
     assert is_segmented == {1: True, 3: False, 5: True, 6: True, 8: False}
 
 
+def test_map_is_final_after_the_last_frame() -> None:
+    """The result of the back end for the last keyframe was applied."""
+    slam = V3DSLAM(CAMERA, square)
+    assert len(list(LiveSLAM([Wall()[0]], slam))) == len(slam.map.keyframes) == 1
+    assert slam.back_end.keyframe is None
+
+
 def test_error_of_a_frame_ends_the_run_after_the_frames_before() -> None:
     def source() -> Iterator[RGBDFrame]:
         yield Wall()[0]
