@@ -17,19 +17,24 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, run_along_wall
+from scipy.spatial.transform import Rotation
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import evaluate
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.occupancy_io import load_occupancy
 from v3d_torch.odometry.rolling_shutter import Readout
-from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline import Pipeline, RunRecord
 from v3d_torch.runs import results as results_module
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.results import prepare_intermediate_results, write_results
 from v3d_torch.runs.run import describe_readout
+from v3d_torch.runs.state_table import make_state_table
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.types import TrackingStatus
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +132,31 @@ def test_frame_table_has_status_keyframe_and_stage_times(results: Path, run: Pip
         assert table[f"seconds_{stage}"].sum() == pytest.approx(total, abs=2e-3)
     after_keyframe = table["keyframe"].shift(1, fill_value=False)  # applied with the next frame
     assert (table["seconds_loop"] > 0).tolist() == (table["seconds_bundle"] > 0).tolist() == after_keyframe.tolist()
+
+
+def test_state_table_has_pose_and_twist_of_the_camera() -> None:
+    T_wc = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.1, -0.7, 0.3], dtype=torch.float64))
+    twist, covariance = torch.arange(1.0, 7.0, dtype=torch.float64), torch.arange(36.0).reshape(6, 6)
+    record = RunRecord()
+    record.states.append_state(
+        CameraState(
+            stamp=0.5,
+            T_wc=T_wc,
+            status=TrackingStatus.ODOMETRY,
+            covariance=covariance,
+            twist=twist,
+            twist_covariance=2 * covariance,
+            cross_covariance=3 * covariance,
+        )
+    )
+    (row,) = make_state_table(record).to_pylist()
+    assert (row["stamp"], row["status"]) == (0.5, "odometry")
+    assert [row[name] for name in ("x", "y", "z")] == T_wc[:3, 3].tolist()
+    rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    assert np.allclose(rotation, T_wc[:3, :3].numpy()) and row["qw"] > 0
+    assert [row[name] for name in ("vx", "vy", "vz", "wx", "wy", "wz")] == twist.tolist()
+    assert row["covariance"] == list(range(36))
+    assert row["pose_latency"] is row["latency"] is row["dropped"] is None  # of a stored sequence
 
 
 def test_ground_truth_is_written_and_gives_the_same_scores(results: Path, run: Pipeline) -> None:
