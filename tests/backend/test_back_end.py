@@ -23,6 +23,7 @@ from v3d_torch.backend.loop_closer import LoopCorrection
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
+from v3d_torch.mapping.culling import cull_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
 from v3d_torch.mapping.sparse_map import SparseMap
@@ -107,6 +108,25 @@ def test_loops_are_detected_from_the_adjusted_poses(demo: RGBDSequence, monkeypa
         assert result is not None and (result.adjustment is not None) is is_adjusted
         assert torch.equal(given[-1], slam.map.T_cw if result.adjustment is None else result.adjustment.T_cw)
         assert torch.equal(given[-1], slam.map.T_cw) is not is_adjusted
+
+
+def test_culled_keyframes_are_no_candidates_of_place_recognition(
+    demo: RGBDSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They have no features left to verify a place, and would take the turn of a keyframe that has."""
+    slam = V3DSLAM(demo.camera, config=make_config(in_background=False))
+    for index in range(4):  # the result of frame 2 is applied with frame 3
+        slam(demo[index])
+    query = slam.map.keyframes[0].features.descriptors
+    assert {index for index, _ in slam.loop_closer._database.query(query, 9)} == {0, 1}
+
+    def cull(sparse_map: SparseMap, *_: object) -> None:
+        cull_keyframes(sparse_map, {1: 0})
+
+    monkeypatch.setattr(v3d_torch.backend.back_end, "cull_redundant_keyframes", cull)
+    for index in range(4, 6):
+        slam(demo[index])
+    assert {index for index, _ in slam.loop_closer._database.query(query, 9)} == {0, 2}
 
 
 def test_error_in_the_background_is_raised_with_the_next_frame(

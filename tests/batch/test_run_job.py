@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from helpers.batches import plan_seeds, repeat_sequence
@@ -36,6 +37,43 @@ def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tm
     progress = []
     assert run_job(moved, progress.append) is None
     assert progress == [5, 6, 7, 8]
+    log = (first.folder / RunFile.LOG).read_text()
+    assert all(f"frame {index} at" in log for index in range(8))
+
+
+def test_interrupted_job_continues_with_another_number_of_threads(moment: Path, tmp_path: Path) -> None:
+    """It changes no result."""
+    (job,) = plan_seeds(moment, tmp_path / "out", seeds=1)
+    _, report = stop_after(4)
+    assert run_job(replace(job, config=job.config.model_copy(update={"threads": 3})), report) is not None
+    progress: list[int] = []
+    assert run_job(job, progress.append) is None
+    assert progress == [5, 6]
+
+
+def test_interrupted_job_starts_again_if_its_configuration_has_changed(moment: Path, tmp_path: Path) -> None:
+    (job,) = plan_seeds(moment, tmp_path / "out", seeds=1)
+    _, report = stop_after(4)
+    assert run_job(job, report) is not None
+    features = job.config.features.model_copy(update={"count": 700})
+    progress: list[int] = []
+    assert run_job(replace(job, config=job.config.model_copy(update={"features": features})), progress.append) is None
+    assert progress == [1, 2, 3, 4, 5, 6]
+
+
+def test_interrupted_job_starts_again_in_an_empty_folder_if_its_sequence_has_changed(
+    moment: Path, tmp_path: Path
+) -> None:
+    sequence = repeat_sequence(moment, tmp_path / "long", frames=8)
+    (job,) = plan_seeds(sequence, tmp_path / "out", seeds=1)
+    _, report = stop_after(4)
+    assert run_job(job, report) is not None
+    (job.folder / "mesh.ply").write_text("of the interrupted run")
+    first, _, *others = (sequence / "associations.txt").read_text().splitlines()
+    (sequence / "associations.txt").write_text("\n".join([first, *others]) + "\n")
+    progress: list[int] = []
+    assert run_job(job, progress.append) is None
+    assert progress == list(range(1, 8)) and not (job.folder / "mesh.ply").exists()
 
 
 def test_job_keeps_the_files_of_a_folder_to_which_another_run_writes(moment: Path, tmp_path: Path) -> None:

@@ -157,6 +157,29 @@ def test_tracking_does_not_wait_for_a_slow_network_on_every_frame() -> None:
     assert segmented == list(range(0, FRAMES, 2))
 
 
+class PoseAware:
+    """Segmenter of the square that records the predicted position of the camera along the wall."""
+
+    def __init__(self) -> None:
+        self.positions: list[float] = []
+
+    def __call__(self, frame: RGBDFrame) -> Instances:
+        return square(frame)
+
+    def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
+        self.positions.append(0.0 if T_cw is None else -float(T_cw[0, 3]))
+        return square(frame)
+
+
+def test_segmenter_of_a_slow_camera_gets_the_pose_that_the_frame_before_predicts() -> None:
+    """From this pose it computes how the image is rotated."""
+    source, send = feed()
+    segment, truth = PoseAware(), Wall().groundtruth
+    assert truth is not None
+    LiveSLAM(source, V3DSLAM(CAMERA, segment))(send)
+    assert segment.positions[3:] == pytest.approx(truth.T_wc[3:, 0, 3].tolist(), abs=0.01)
+
+
 def test_at_most_every_second_tracked_frame_is_segmented_while_frames_are_dropped() -> None:
     """Frames 2, 4 and 7 are dropped. A frame after a gap is not segmented if the tracked frame before it was."""
     captured = LatestQueue[CapturedFrame]()
@@ -172,6 +195,13 @@ def test_at_most_every_second_tracked_frame_is_segmented_while_frames_are_droppe
     captured.close()
     preprocessor.close()
     assert is_segmented == {1: True, 3: False, 5: True, 6: True, 8: False}
+
+
+def test_map_is_final_after_the_last_frame() -> None:
+    """The result of the back end for the last keyframe was applied."""
+    slam = V3DSLAM(CAMERA, square)
+    assert len(list(LiveSLAM([Wall()[0]], slam))) == len(slam.map.keyframes) == 1
+    assert slam.back_end.keyframe is None
 
 
 def test_error_of_a_frame_ends_the_run_after_the_frames_before() -> None:

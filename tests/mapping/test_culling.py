@@ -103,6 +103,14 @@ def test_first_and_newest_keyframe_are_kept_and_a_ratio_of_1_keeps_all() -> None
     assert {0, 8} < kept and len(kept) == 3  # each landmark is observed by only 2 others
 
 
+def test_culled_landmarks_do_not_make_a_keyframe_redundant() -> None:
+    """Enough other keyframes observe 15 landmarks of keyframe 1, of which one is left, but not its other five."""
+    shared = dict.fromkeys(range(15), 0)
+    sparse_map = make_map([ALL, shared, shared, shared])
+    sparse_map.landmarks["active"][1:15] = False
+    assert 1 not in cull(sparse_map, redundant_ratio=0.5, redundant_views=2)
+
+
 def test_culling_a_keyframe_removes_its_observations_and_its_own_landmarks_only() -> None:
     """The landmark that no other keyframe observes becomes inactive; other observations stay."""
     sparse_map = make_map([])
@@ -121,6 +129,15 @@ def test_culling_a_keyframe_removes_its_observations_and_its_own_landmarks_only(
         landmarks = torch.full_like(keyframe.landmarks, -1)
         landmarks[sparse_map.observations["feature"][rows]] = sparse_map.observations["landmark"][rows]
         assert torch.equal(landmarks, keyframe.landmarks)
+
+
+def test_landmark_that_only_a_culled_keyframe_still_observes_becomes_inactive() -> None:
+    """Bundle adjustment has removed its observations by the other keyframes as outliers."""
+    sparse_map = make_map([ALL, ALL])
+    rows = (sparse_map.observations["landmark"] == 3) & (sparse_map.observations["keyframe"] != 1)
+    sparse_map.remove_observations(torch.nonzero(rows)[:, 0])
+    cull_keyframes(sparse_map, {1: 2})
+    assert torch.nonzero(~sparse_map.landmarks["active"]).tolist() == [[3]]
 
 
 def test_culled_keyframes_and_their_landmarks_move_with_the_reference_keyframe() -> None:
@@ -151,6 +168,12 @@ def test_reference_of_a_culled_keyframe_is_active_if_both_are_culled_at_once() -
     assert [keyframe.reference for keyframe in sparse_map.keyframes] == [0, 0, 0, 3]
 
 
+def test_reference_of_a_culled_keyframe_is_the_newest_of_those_that_share_most_landmarks() -> None:
+    sparse_map = make_map([ALL] * 4)
+    assert cull(sparse_map, redundant_views=3) == {2, 3}
+    assert [keyframe.reference for keyframe in sparse_map.keyframes] == [0, 1, 4, 4, 4]
+
+
 def test_consecutive_active_keyframes_are_connected_across_culled_ones() -> None:
     sparse_map = make_map([dict.fromkeys(range(LANDMARKS), 0) for _ in range(5)])
     cull_keyframes(sparse_map, {1: 0, 2: 0, 4: 5})
@@ -173,16 +196,26 @@ def test_landmarks_with_a_low_found_ratio_are_culled_after_the_next_keyframe() -
     assert sparse_map.landmarks["active"].tolist() == [True, True, False, False]
 
 
+def test_landmark_that_a_quarter_of_the_frames_match_is_not_culled() -> None:
+    sparse_map = make_empty_map()
+    sparse_map.insert_keyframe(0, 0.0, EYE, random_features(2), torch.full((2,), -1))
+    for found in ([0, 1], [0], [0], [0], [0], [0], [0]):  # with the keyframe, landmark 1 is found in 2 of 8 frames
+        sparse_map.count_matches(torch.tensor(found), torch.arange(2))
+    insert(sparse_map, {0: 0, 1: 0})
+    cull_landmarks(sparse_map)
+    assert sparse_map.landmarks["active"].all()
+
+
 def test_landmarks_without_a_second_observation_are_culled_after_three_keyframes() -> None:
     sparse_map = make_empty_map()
     sparse_map.insert_keyframe(0, 0.0, EYE, random_features(3), torch.full((3,), -1))
-    for _ in range(2):
-        insert(sparse_map, {1: 0})
+    for observed in ({1: 0, 2: 0}, {1: 0}):
+        insert(sparse_map, observed)
         cull_landmarks(sparse_map)
     assert sparse_map.landmarks["active"].all()
     insert(sparse_map, {})
     cull_landmarks(sparse_map)
-    assert sparse_map.landmarks["active"].tolist() == [False, True, False]
+    assert sparse_map.landmarks["active"].tolist() == [False, True, True]
     sparse_map.remove_observations(torch.nonzero(sparse_map.observations["keyframe"] > 0)[:, 0])
     insert(sparse_map, {})
     cull_landmarks(sparse_map)

@@ -72,6 +72,18 @@ def test_new_landmarks_come_from_unmatched_features_with_depth_up_to_the_maximum
     assert len(sparse_map.landmarks) == 60 + 35
 
 
+def test_keyframe_that_observes_more_landmarks_than_the_maximum_creates_none() -> None:
+    """As with a lower maximum in a map of an earlier run, or with more features than landmarks per keyframe."""
+    sparse_map = make_map(landmarks_per_keyframe=60)
+    insert(sparse_map, [])
+    sparse_map.insert_keyframe(1, 0.0, EYE, features(200), unmatched(200))
+    sparse_map.insert_keyframe(2, 0.1, EYE, features(200, seed=1), unmatched(200))
+    matched = unmatched(200)
+    matched[:70] = torch.arange(70)
+    third = sparse_map.insert_keyframe(3, 0.2, EYE, features(200), matched)
+    assert torch.equal(third.landmarks, matched) and len(sparse_map.landmarks) == 120
+
+
 def test_distant_features_create_landmarks() -> None:
     keyframe = make_map().insert_keyframe(0, 0.0, EYE, features(120, depth=6.0), unmatched(120))
     assert (keyframe.landmarks >= 0).all()

@@ -12,17 +12,23 @@ from typing import cast
 
 import cv2
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers import walls
+from helpers.moving_camera import keyframe
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
 from helpers.walls import Slide
 from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.readable_frames import BrokenFrame
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.datasets.stored import max_broken_frames
+from v3d_torch.errors import InputError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
@@ -70,6 +76,42 @@ def test_time_of_the_run_does_not_contain_the_comparison_with_true_masks() -> No
     record = make_pipeline(MaskedWall())()
     assert record.mask_evaluation.compute_scores() is not None
     assert 0 < record.seconds < time.perf_counter() - begin - 0.05 * FRAMES
+
+
+def test_time_of_a_resumed_run_contains_that_before() -> None:
+    """Also in its checkpoints, which are saved after a frame."""
+    pipeline, seconds = make_pipeline(), list[float]()
+    pipeline.record.seconds = 100.0
+    record = pipeline(lambda *_: seconds.append(pipeline.record.seconds))
+    assert len(seconds) == FRAMES and sorted([100.0, *seconds, record.seconds]) == [100.0, *seconds, record.seconds]
+
+
+def test_run_whose_frame_failed_is_not_between_frames() -> None:
+    """No checkpoint can be saved, because the frame may have changed a part of the state."""
+    pipeline = make_pipeline()
+
+    def fail(*_: object) -> None:
+        if len(pipeline.slam.poses) == 4:
+            raise ZeroDivisionError
+
+    with pipeline.slam.register_stage_hook("odometry", fail):
+        assert "ZeroDivisionError" in str(pipeline().failure)
+    assert len(pipeline.slam.poses) == 4 and not pipeline.between_frames
+
+
+def test_true_masks_are_not_read_after_the_first_that_cannot_be_read() -> None:
+    """The scores are then not those of the whole sequence, and the first error is reported."""
+    asked: list[int] = []
+
+    class DamagedMasks(Wall):
+        def motion_mask(self, index: int) -> Tensor:
+            asked.append(index)
+            if index >= 2:
+                raise InputError(f"mask {index}: is damaged")
+            return torch.zeros(240, 320, dtype=torch.uint8)
+
+    record = make_pipeline(DamagedMasks())()
+    assert asked == [0, 1, 2] and record.mask_error == "mask 2: is damaged" and record.failure is None
 
 
 def test_snapshots_of_a_stream_that_drops_frames_reach_from_its_first_to_its_last_frames() -> None:
@@ -143,6 +185,25 @@ def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> N
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
 
 
+class DamagedWall(Wall):
+    """The wall as an `RGBDSequence`, in which frame 3 is broken."""
+
+    def __init__(self) -> None:
+        super().__init__(broken=3)
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return map(self.__getitem__, range(FRAMES))
+
+
+def test_broken_frames_before_a_run_was_resumed_count_towards_the_limit() -> None:
+    broken = [BrokenFrame(0, "is damaged")] * max_broken_frames(FRAMES)
+    for earlier, failed in ((broken[1:], False), (broken, True)):
+        pipeline = Pipeline(DamagedWall(), V3DSLAM(CAMERA, square), skip_broken=True)
+        pipeline.record.broken = list(earlier)
+        failure = pipeline().failure
+        assert (failure is not None and "--skip-broken skips at most" in failure) is failed
+
+
 def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
     no_margins = [
         *("objects.clouds.stride=1", "objects.static_mask.depth_margin=0", "objects.static_mask.dilation=0"),
@@ -157,6 +218,58 @@ def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert image.dtype == np.uint8
         assert np.array_equal(image, np.where(square(Wall()[0]).masks[0].numpy(), 255, 0))
+
+
+def test_frame_that_is_interrupted_after_its_pose_was_stored_has_no_row_in_the_tables(tmp_path: Path) -> None:
+    pipeline = make_pipeline()
+
+    def interrupt(*_: object) -> None:
+        if len(pipeline.slam.poses) == 5:
+            raise KeyboardInterrupt
+
+    with pipeline.slam.register_stage_hook("estimate_state", interrupt):
+        pipeline()
+    assert len(pipeline.slam.poses) == 5
+    pipeline.flush()
+    write_results(tmp_path, pipeline)
+    for name in ("frames", "states", "dynamics"):
+        assert len(pq.read_table(tmp_path / f"{name}.parquet")) == 4, name
+
+
+class DelayedWall(Wall):
+    """The wall, whose depth images are taken 10 ms after the colour images."""
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        return replace(super().__getitem__(index), depth_delay=0.01)
+
+
+def test_maps_leave_out_more_pixels_than_tracking_in_mask_images_and_views(tmp_path: Path) -> None:
+    """Maps have a larger margin around people. The views also have the delay of their depth."""
+    results: dict[float, FrameResult] = {}
+    slam = V3DSLAM(CAMERA, square, load_config(overrides=["mapping.max_keyframe_interval=5"]))
+    pipeline = Pipeline(DelayedWall(), slam, tmp_path / "masks", map_masks=tmp_path / "map_masks")
+    pipeline(lambda frame, result: results.update({frame.stamp: result}))
+    assert len(results) == FRAMES and len(pipeline.views) > 1
+    for stamp, result in results.items():
+        assert bool((result.static_mask & ~result.static_without_people).any())
+        for folder, static in (("masks", result.static_mask), ("map_masks", result.static_without_people)):
+            image = cv2.imread(str(tmp_path / folder / f"{stamp:.6f}.png"), cv2.IMREAD_UNCHANGED)
+            assert np.array_equal(image == 0, static.numpy())
+    for view in pipeline.views:
+        static = results[view.keyframe.stamp].static_without_people
+        assert torch.equal(view.depth > 0, static[:: pipeline.views.stride, :: pipeline.views.stride])
+        assert view.depth_delay == 0.01
+
+
+def test_occupancy_map_is_corrected_with_the_final_poses() -> None:
+    pipeline = run_along_wall("occupancy.enabled=true")
+    slam, further = pipeline.slam, torch.eye(4, dtype=torch.float64)
+    slam.flush()
+    further[2, 3] = -1.0
+    slam.map.move_keyframes(slam.map.T_cw @ further)
+    pipeline.flush()
+    assert slam.occupancy is not None
+    assert (slam.occupancy.map.occupied_points[:, 2] - (WALL + 1)).abs().max() < 0.1
 
 
 def test_masks_that_cannot_be_written_end_the_run_with_a_message(tmp_path: Path) -> None:
@@ -184,6 +297,26 @@ def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
     assert checked == ([] if live else [1])
     pipeline.flush()
     assert checked == ([len(pipeline.slam.poses)] if live else [1])
+
+
+def test_camera_is_checked_when_its_own_run_has_enough_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views of a known map can be of another camera, and say nothing about this one."""
+    checked: list[int] = []
+    slam = V3DSLAM(CAMERA, square, load_config(overrides=["mapping.max_keyframe_interval=5"]))
+    views = StaticViews(CAMERA, slam.config.dense_map.stride)
+    for _ in range(3):
+        earlier = replace(keyframe(), frame=-1)
+        views.add(earlier, Wall()[0].image, Wall()[0].depth, torch.ones(240, 320, dtype=torch.bool))
+    pipeline = Pipeline(Wall(), slam, views=views)
+
+    def check(*_: object) -> list[str]:
+        checked.append(len(pipeline.slam.poses))
+        return []
+
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline.check_plausibility", check)
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline._CHECKED_KEYFRAMES", 2)
+    pipeline()
+    assert checked == [6]  # frames 0 and 5 became keyframes
 
 
 class Jump:

@@ -7,6 +7,7 @@ import torch
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.types import RGBDFrame
@@ -36,6 +37,22 @@ def test_values_of_an_object_without_a_centroid_are_nan() -> None:
     table.append_objects(frame, FrameObjects([chair], mask, mask, []), torch.tensor([0.0, -1.0, 0.0]))
     for column in ("centroid", "velocity", "sigmas", "box"):
         assert table[column].isnan().all(), column
+
+
+def test_row_of_an_object_has_its_votes_and_its_box() -> None:
+    mask, up = torch.zeros(1, 1, dtype=torch.bool), torch.tensor([0.0, -1.0, 0.0])
+    position, velocity = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    state = ObjectState(0.1, position, velocity, (1e-4, 0.0, 1e-2), 1.0)
+    along = torch.linspace(-0.5, 0.5, 9)[:, None]
+    cloud = along * torch.tensor([[0.8, 0.0, 0.6]]) + position.float()
+    cloud = torch.cat([cloud, cloud + torch.tensor([0.0, 0.3, 0.0])])  # an upright board, 1 m long
+    board = TrackedObject(4, 56, mask, state, (), 3, 0.1, MotionState.DYNAMIC, missed=False, cloud=cloud)
+    found, table = FrameObjects([board], mask, mask, []), ObjectTable()
+    table.append_objects(RGBDFrame(0, 0.1, torch.zeros(3, 1, 1), torch.zeros(1, 1, 1)), found, up)
+    (box,) = found.boxes(up).values()
+    assert abs(box.yaw) > 0.5
+    expected = [*box.T_wb[:3, 3].tolist(), *box.size.tolist(), box.yaw]
+    assert table["box"].tolist() == [expected] and table["votes"].tolist() == [3]
 
 
 @pytest.mark.parametrize("name", ["pose_latency", "latency"])

@@ -17,19 +17,24 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, run_along_wall
+from scipy.spatial.transform import Rotation
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import evaluate
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.occupancy_io import load_occupancy
 from v3d_torch.odometry.rolling_shutter import Readout
-from v3d_torch.pipeline import Pipeline
+from v3d_torch.pipeline import Pipeline, RunRecord
 from v3d_torch.runs import results as results_module
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.results import prepare_intermediate_results, write_results
 from v3d_torch.runs.run import describe_readout
+from v3d_torch.runs.state_table import make_state_table
+from v3d_torch.tracking.camera_state import CameraState
+from v3d_torch.types import TrackingStatus
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +134,31 @@ def test_frame_table_has_status_keyframe_and_stage_times(results: Path, run: Pip
     assert (table["seconds_loop"] > 0).tolist() == (table["seconds_bundle"] > 0).tolist() == after_keyframe.tolist()
 
 
+def test_state_table_has_pose_and_twist_of_the_camera() -> None:
+    T_wc = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.1, -0.7, 0.3], dtype=torch.float64))
+    twist, covariance = torch.arange(1.0, 7.0, dtype=torch.float64), torch.arange(36.0).reshape(6, 6)
+    record = RunRecord()
+    record.states.append_state(
+        CameraState(
+            stamp=0.5,
+            T_wc=T_wc,
+            status=TrackingStatus.ODOMETRY,
+            covariance=covariance,
+            twist=twist,
+            twist_covariance=2 * covariance,
+            cross_covariance=3 * covariance,
+        )
+    )
+    (row,) = make_state_table(record).to_pylist()
+    assert (row["stamp"], row["status"]) == (0.5, "odometry")
+    assert [row[name] for name in ("x", "y", "z")] == T_wc[:3, 3].tolist()
+    rotation = Rotation.from_quat([row[name] for name in ("qx", "qy", "qz", "qw")]).as_matrix()
+    assert np.allclose(rotation, T_wc[:3, :3].numpy()) and row["qw"] > 0
+    assert [row[name] for name in ("vx", "vy", "vz", "wx", "wy", "wz")] == twist.tolist()
+    assert row["covariance"] == list(range(36))
+    assert row["pose_latency"] is row["latency"] is row["dropped"] is None  # of a stored sequence
+
+
 def test_ground_truth_is_written_and_gives_the_same_scores(results: Path, run: Pipeline) -> None:
     written, truth = read_trajectory(results / "groundtruth.txt"), run.sequence.groundtruth
     assert truth is not None
@@ -194,6 +224,39 @@ def test_mesh_is_written_if_configured(run: Pipeline, results: Path, tmp_path: P
     mesh = plyfile.PlyData.read(tmp_path / "mesh.ply")
     assert np.abs(np.asarray(mesh["vertex"]["z"]) - WALL).max() < 0.02
     assert mesh["face"].count > 1000 and mesh["vertex"]["red"].std() > 10
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_mesh_leaves_out_a_part_of_the_map_whose_place_is_a_guess(
+    run: Pipeline, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run.flush()
+    monkeypatch.setattr(run.slam, "config", load_config(overrides=["dense_map.mesh.enabled=true"]))
+    ends = []
+    for part in (0, 1):
+        monkeypatch.setattr(run.slam.map.keyframes[-1], "part", part)
+        write_results(tmp_path, run)
+        ends.append(float(plyfile.PlyData.read(tmp_path / "mesh.ply")["vertex"]["x"].max()))
+    assert ends[1] < ends[0] - 0.1  # the last keyframe is at the right end of the wall
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_keyframe_of_an_earlier_run_is_none_of_this_run_even_at_the_same_time(
+    run: Pipeline, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when a recording is run again in its own map."""
+    count, second = len(run.slam.map.keyframes), run.slam.map.keyframes[1]
+    monkeypatch.setattr(second, "frame", -1)
+    write_results(tmp_path, run)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["keyframes"], metrics["known_keyframes"]) == (count - 1, 1)
+    frames = pq.read_table(tmp_path / "frames.parquet").to_pandas()
+    stamps = frames["stamp"][frames["keyframe"]].tolist()
+    assert stamps == read_trajectory(tmp_path / "keyframes.txt").stamps.tolist()
+    assert len(stamps) == count - 1 and second.stamp not in stamps
+    green = [plyfile.PlyData.read(folder / "trajectory.ply")["vertex"]["green"] for folder in (results, tmp_path)]
+    changed = np.flatnonzero(green[0] != green[1])  # its frustum no longer has the colour of its time
+    assert changed.tolist() == list(range(FRAMES + 6, FRAMES + 12))
 
 
 def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:

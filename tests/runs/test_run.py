@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.wall_run import FRAMES, Wall, square
+from helpers.wall_run import CAMERA, FRAMES, Wall, square
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import pipeline as pipeline_module
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.report_page import render_page
@@ -25,7 +26,8 @@ from v3d_torch.runs.result_tables import ResultTables
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.stored_run import read_run
 from v3d_torch.segmentation import MaskFolder
-from v3d_torch.types import RGBDFrame
+from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 
 def test_poses_and_sparse_map_are_written_before_the_point_map_is_fused(
@@ -92,15 +94,32 @@ def test_run_that_never_finds_the_camera_stores_the_cause_and_no_scores(
     assert "ATE RMSE" not in page and "The camera was not found in any frame" in page
 
 
-class Covered(Wall):
+def test_run_that_ended_early_has_no_diagnosis(tmp_path: Path) -> None:
+    """The frames that it lacks could be different."""
+
+    def interrupt(frame: RGBDFrame, result: FrameResult) -> None:
+        if frame.index == 3:
+            raise KeyboardInterrupt
+
+    run = Run(RunRequest("wall", Config()), WallWithoutDepth(), square, tmp_path)
+    run(interrupt)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["failure"] == f"interrupted after 4 of {FRAMES} frames" and metrics["diagnosis"] is None
+
+
+class StoredWall(Wall):
+    """The wall as an `RGBDSequence`, whose images the diagnosis reads again."""
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return map(self.__getitem__, range(FRAMES))
+
+
+class Covered(StoredWall):
     """The wall as seen by a camera whose lens is covered after some frames."""
 
     def __init__(self, frames: int) -> None:
         super().__init__()
         self._frames = frames
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return map(self.__getitem__, range(FRAMES))
 
     def __getitem__(self, index: int) -> RGBDFrame:
         frame = super().__getitem__(index)
@@ -115,6 +134,81 @@ def test_cause_of_the_loss_of_most_frames_is_a_warning(tmp_path: Path, frames: i
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     text = f"{FRAMES - frames} of {FRAMES} frames are lost: the colour images are uniform;"
     assert sum(warning.startswith(text) for warning in metrics["warnings"]) == 1 and metrics["diagnosis"] is None
+
+
+class PartlyFar(StoredWall):
+    """The wall in the dark in the first frames, and far beyond the maximum depth in the others."""
+
+    def __init__(self, dark: int) -> None:
+        super().__init__()
+        self._dark = dark
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame = super().__getitem__(index)
+        if index < self._dark:
+            return replace(frame, image=torch.zeros_like(frame.image))
+        return replace(frame, depth=20 * frame.depth)
+
+
+class Strip(StoredWall):
+    """A strip of the wall, 60 rows high."""
+
+    camera = replace(CAMERA, height=60, cy=29.5)
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame = super().__getitem__(index)
+        return replace(frame, image=frame.image[:, :60], depth=frame.depth[:, :60])
+
+
+class Unrelated(StoredWall):
+    """A wall that is painted anew for every frame."""
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame, generator = super().__getitem__(index), torch.Generator().manual_seed(index)
+        blocks = torch.randint(0, 256, (3, 60, 80), generator=generator, dtype=torch.uint8)
+        return replace(frame, image=blocks.repeat_interleave(4, dim=1).repeat_interleave(4, dim=2))
+
+
+def no_instances(frame: RGBDFrame) -> Instances:
+    return Instances.empty(*frame.depth.shape[1:])
+
+
+def whole_image(frame: RGBDFrame) -> Instances:
+    return Instances.from_masks(torch.ones(1, *frame.depth.shape[1:], dtype=torch.bool), torch.tensor([PERSON]))
+
+
+@pytest.mark.parametrize(
+    ("sequence", "segment", "overrides", "cause"),
+    [
+        (PartlyFar(0), square, (), f"nearly all depth is beyond {Config().features.max_depth:g} m; correct the camera"),
+        (PartlyFar(FRAMES // 2), square, (), "at most 0 features of an image have depth"),  # no other cause of all
+        (Strip(), no_instances, ("mapping.min_tracked=900",), "images of 320x60 pixels have too few features"),
+    ],
+    ids=["far", "partly dark and partly far", "small images"],
+)
+def test_diagnosis_names_the_cause_of_a_lost_camera(
+    sequence: Wall, segment: Segmenter, overrides: tuple[str, ...], cause: str, tmp_path: Path
+) -> None:
+    run = Run(RunRequest("wall", load_config(overrides=list(overrides))), sequence, segment, tmp_path)
+    run(lambda *_: None)
+    expected = f"wall: the camera was not found in any of the {FRAMES} frames, {cause}"
+    assert str(run.pipeline.record.diagnosis).startswith(expected)
+
+
+def late_square(frame: RGBDFrame) -> Instances:
+    return square(frame) if frame.index >= FRAMES - 3 else no_instances(frame)
+
+
+@pytest.mark.parametrize(
+    ("segment", "cause"),
+    [(whole_image, "masked objects cover the images"), (late_square, "no features can be tracked between frames")],
+)
+def test_objects_are_the_cause_only_if_they_are_in_most_of_the_lost_frames(
+    segment: Segmenter, cause: str, tmp_path: Path
+) -> None:
+    run = Run(RunRequest("wall", Config()), Unrelated(), segment, tmp_path)
+    run(lambda *_: None)
+    assert any(f" of {FRAMES} frames are lost: {cause}" in each for each in run.pipeline.record.warnings)
 
 
 def test_loss_of_few_frames_has_no_warning(tmp_path: Path) -> None:

@@ -125,6 +125,20 @@ def test_error_of_a_frame_turns_with_the_camera_between_frames(end: int) -> None
     torch.testing.assert_close(between[0].covariance - between[1].covariance, expected)
 
 
+def test_status_between_frames_is_that_of_the_nearer_frame() -> None:
+    states = StateHistory()
+    states.append(state(1.0, status=TrackingStatus.TRACKED))
+    states.append(state(1.1, status=TrackingStatus.LOST))
+    assert states.at(1.04).status is TrackingStatus.TRACKED and states.at(1.06).status is TrackingStatus.LOST
+
+
+def test_errors_of_pose_and_twist_between_frames_correlate_as_at_both_frames() -> None:
+    still, states = torch.eye(4, dtype=torch.float64), StateHistory()
+    for stamp, correlation in ((0.0, -0.8), (1.0, 0.4)):
+        states.append(replace(state(stamp, still), cross_covariance=correlation * SMALL))
+    torch.testing.assert_close(states.at(0.25).cross_covariance, -0.5 * SMALL)
+
+
 def test_covariance_between_frames_covers_motions_of_a_hand() -> None:
     """Paths of white acceleration noise, whose ends are known, have the covariance at a time between (Monte Carlo)."""
     generator = torch.Generator().manual_seed(0)

@@ -17,7 +17,8 @@ from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracking
 from v3d_torch.types import FramePose, TrackingStatus
 
-TRACKED, ODOMETRY, LOST = TrackingStatus.TRACKED, TrackingStatus.ODOMETRY, TrackingStatus.LOST
+TRACKED, DISCONNECTED = TrackingStatus.TRACKED, TrackingStatus.DISCONNECTED
+ODOMETRY, LOST = TrackingStatus.ODOMETRY, TrackingStatus.LOST
 
 
 def track(previous: TrackingStatus, *, in_local_map: bool, at_known_place: bool) -> FramePose:
@@ -33,21 +34,36 @@ def track(previous: TrackingStatus, *, in_local_map: bool, at_known_place: bool)
         return SimpleNamespace(tracking=found) if at_known_place else None
 
     camera = Camera()
-    camera.append(0.0, frame_pose(EYE, previous), keyframe)
+    if previous is DISCONNECTED:
+        keyframe.part = sparse_map.unused_part
+    camera.append(0.0, frame_pose(EYE, TRACKED if previous is DISCONNECTED else previous), keyframe)
+    assert camera.poses.status is previous
     motion = CameraMotion(EYE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), True)
     tracker = CameraTracker(track_map, SimpleNamespace(relocalise=relocalise), sparse_map, 5)  # type: ignore[arg-type]
     depth: Tensor = torch.zeros(1, 480, 640)
     return tracker(features(20), depth, EYE, unmatched, motion, camera.poses)
 
 
-@pytest.mark.parametrize("previous", [TRACKED, ODOMETRY, LOST])
+@pytest.mark.parametrize("previous", [TRACKED, DISCONNECTED, ODOMETRY, LOST])
 def test_camera_is_relocalised_if_its_pose_does_not_continue_one_in_the_map(previous: TrackingStatus) -> None:
     tracked = track(previous, in_local_map=True, at_known_place=False)
-    assert tracked.status is TRACKED and tracked.is_relocalised is (previous is not TRACKED)
+    assert tracked.status is TRACKED and tracked.is_relocalised is (previous in (ODOMETRY, LOST))
     found = track(previous, in_local_map=False, at_known_place=True)
     assert found.status is TRACKED and found.is_relocalised
     missed = track(previous, in_local_map=False, at_known_place=False)
-    assert missed.status is (LOST if previous is LOST else ODOMETRY) and not missed.is_relocalised
+    assert missed.status is (LOST if previous in (DISCONNECTED, LOST) else ODOMETRY) and not missed.is_relocalised
+
+
+def test_tracked_frame_counts_which_landmarks_it_found_of_those_in_view() -> None:
+    """Landmarks that few frames find are culled."""
+    sparse_map, unmatched = make_map(), torch.full((20,), -1)
+    keyframe = sparse_map.insert_keyframe(0, 0.0, EYE, features(20), unmatched)
+    found = MapTracking(EYE, keyframe.landmarks.where(torch.arange(20) < 5, -1), keyframe.landmarks, EYE)
+    tracker = CameraTracker(lambda *args: found, SimpleNamespace(relocalise=None), sparse_map, 5)  # type: ignore[arg-type]
+    motion = CameraMotion(EYE, torch.zeros(6, dtype=torch.float64), torch.zeros(0, 2, dtype=torch.int64), True)
+    tracker(features(20), torch.zeros(1, 480, 640), EYE, unmatched, motion, Camera().poses)
+    assert sparse_map.landmarks["found"].tolist() == [2] * 5 + [1] * 15
+    assert sparse_map.landmarks["visible"].tolist() == [2] * 20
 
 
 def test_frame_without_landmarks_does_not_move_with_another_part_of_the_map() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.types import TrackingStatus
+from v3d_torch.types import MIN_INTERVAL, TrackingStatus
 
 
 def test_history_without_frames_is_at_the_origin() -> None:
@@ -61,6 +61,13 @@ def test_prediction_of_a_lost_camera_continues_shortly_and_then_stands_still() -
     assert steps[:4].min() > 0.9 * speed / 30  # continues
     assert (steps[8:] < 1e-12).all()  # stands still
     assert steps.sum() < 0.3 * speed
+
+
+def test_velocity_between_frames_that_were_received_at_once_is_not_larger_than_that_of_the_camera() -> None:
+    camera = Camera()
+    camera.append(0.0, frame_pose(EYE), None)
+    camera.append(1e-4, frame_pose(se3_exp(MIN_INTERVAL * TWIST)), None)
+    torch.testing.assert_close(camera.model.velocity, TWIST, rtol=0, atol=1e-9)
 
 
 def test_velocity_of_a_lost_camera_follows_measured_motions() -> None:
