@@ -199,9 +199,17 @@ def late_square(frame: RGBDFrame) -> Instances:
     return square(frame) if frame.index >= FRAMES - 3 else no_instances(frame)
 
 
+def static_square(frame: RGBDFrame) -> Instances:
+    return replace(square(frame), labels=torch.tensor([62]))  # a screen, which is never seen to move
+
+
 @pytest.mark.parametrize(
     ("segment", "cause"),
-    [(whole_image, "masked objects cover the images"), (late_square, "no features can be tracked between frames")],
+    [
+        (whole_image, "masked objects cover the images"),
+        (late_square, "no features can be tracked between frames"),
+        (static_square, "no features can be tracked between frames"),
+    ],
 )
 def test_objects_are_the_cause_only_if_they_are_in_most_of_the_lost_frames(
     segment: Segmenter, cause: str, tmp_path: Path

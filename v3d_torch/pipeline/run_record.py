@@ -145,6 +145,10 @@ class ObjectTable(TensorTable):
         """Return the number of different objects."""
         return len(self["id"].unique())
 
+    def frames_with_masked_objects(self) -> Tensor:
+        """Return the indices of the frames with objects that are not static, which tracking leaves out, int64, (N,)."""
+        return self["frame"][self["motion_state"] != _MOTION_STATES.index(MotionState.STATIC)].unique()
+
     def count_motion_states(self) -> dict[MotionState, int]:
         """Return the number of rows, frames times objects, with each motion state, in the order of their first row."""
         return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
