@@ -37,7 +37,7 @@ VARIANTS = {
     "no_unlabelled": "no unlabelled instances",
     "not_upright": "images not rotated upright",
     "global_shutter": "no model of the rolling shutter",
-    "paper": "the paper's rules of the object stages",
+    "paper": "the paper's rules for votes, Chamfer distances and motion states",
     "full": "full",
 }
 """Names of the variants of the ablation study in tables."""

@@ -42,7 +42,7 @@ def test_sequence_of_the_newest_outcome_is_last(tmp_path: Path) -> None:
     record = BatchRecord(jobs, tmp_path)
     for job in (jobs[4], jobs[1], jobs[0], jobs[5]):
         record.add(JobFinished(job, "it broke"))
-    newest_last = [(outcome.sequence, outcome.config) for outcome in record.newest_last]
+    newest_last = [(outcome.sequence, outcome.config) for outcome in record.outcomes_newest_last]
     assert newest_last == [("attic", "full"), ("attic", "paper"), ("hall", "full"), ("hall", "paper")]
     record.add(JobFinished(jobs[2], "it broke"))
-    assert record.newest_last[-1].sequence == "cellar"
+    assert record.outcomes_newest_last[-1].sequence == "cellar"

@@ -28,16 +28,16 @@ def fail_all(jobs: Sequence[Job], stop: Event) -> Generator[JobFinished]:
 class CountedRecord(BatchRecord):
     """Record that counts its live tables."""
 
-    live_tables = 0
+    tables_made = 0
 
-    def live_table(self) -> ErrorTable | None:
-        self.live_tables += 1
-        return super().live_table()
+    def progress_table(self) -> ErrorTable | None:
+        self.tables_made += 1
+        return super().progress_table()
 
 
 @pytest.mark.parametrize("is_terminal", [False, True])
-def test_live_table_is_made_for_a_terminal_only(is_terminal: bool, moment: Path, tmp_path: Path) -> None:
+def test_progress_table_is_made_for_a_terminal_only(is_terminal: bool, moment: Path, tmp_path: Path) -> None:
     record = CountedRecord(plan_seeds(moment, tmp_path, seeds=3), tmp_path)
     with pytest.raises(InputError, match=r"^3 of 3 runs failed; .* to run them again$"):
         run_missing_jobs(record, fail_all, Console(file=StringIO(), force_terminal=is_terminal), resume=False)
-    assert record.live_tables == 3 * is_terminal
+    assert record.tables_made == 3 * is_terminal

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -61,6 +62,13 @@ class Wall:
             raise KeyboardInterrupt
         image = torch.from_numpy(self._wall[:, STEP * index : STEP * index + 320].copy()).permute(2, 0, 1)
         return RGBDFrame(index, float(self.stamps[index]), image, torch.full((1, 240, 320), WALL))
+
+
+class StoredWall(Wall):
+    """The wall as an `RGBDSequence`, whose images can be read again."""
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        return map(self.__getitem__, range(FRAMES))
 
 
 def square(frame: RGBDFrame) -> Instances:

@@ -17,7 +17,7 @@ import pytest
 import torch
 from helpers import walls
 from helpers.moving_camera import keyframe
-from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, make_pipeline, run_along_wall, square
+from helpers.wall_run import CAMERA, FRAMES, WALL, StoredWall, Wall, make_pipeline, run_along_wall, square
 from helpers.walls import Slide
 from torch import Tensor
 
@@ -185,20 +185,10 @@ def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> N
     assert len((tmp_path / "trajectory.txt").read_text().splitlines()) == 4
 
 
-class DamagedWall(Wall):
-    """The wall as an `RGBDSequence`, in which frame 3 is broken."""
-
-    def __init__(self) -> None:
-        super().__init__(broken=3)
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return map(self.__getitem__, range(FRAMES))
-
-
 def test_broken_frames_before_a_run_was_resumed_count_towards_the_limit() -> None:
     broken = [BrokenFrame(0, "is damaged")] * max_broken_frames(FRAMES)
     for earlier, failed in ((broken[1:], False), (broken, True)):
-        pipeline = Pipeline(DamagedWall(), V3DSLAM(CAMERA, square), skip_broken=True)
+        pipeline = Pipeline(StoredWall(broken=3), V3DSLAM(CAMERA, square), skip_broken=True)
         pipeline.record.broken = list(earlier)
         failure = pipeline().failure
         assert (failure is not None and "--skip-broken skips at most" in failure) is failed

@@ -34,7 +34,7 @@ def test_damaged_ground_truth_is_noted_before_a_run(tmp_path: Path) -> None:
         open_sequence(str(tmp_path / "seq"), None, Console(file=output, width=300))
         (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
     (note,) = output.getvalue().splitlines()
-    assert note.startswith(f"note: seq: no ground truth, and so no scores: {tmp_path / 'seq' / 'groundtruth.txt'}: ")
+    assert note.startswith(f"note: seq: the ground truth cannot be read: {tmp_path / 'seq' / 'groundtruth.txt'}: ")
 
 
 @pytest.mark.parametrize(
@@ -77,6 +77,6 @@ def test_all_sequences_that_are_not_valid_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=f"^3 of 4 sequences are not valid, the first: {re.escape(str(names[1]))}: "):
         open_sequences([*map(str, names), str(names[1])], None, Console(file=output, width=300))
     heading, *lines = output.getvalue().splitlines()
-    assert heading == "not valid:" and len(lines) == 3
+    assert heading == "These sequences are not valid:" and len(lines) == 3
     for name, line in zip(names[1:], lines, strict=True):
         assert line.startswith(str(name))

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, Wall, square
+from helpers.wall_run import CAMERA, FRAMES, StoredWall, Wall, square
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
@@ -105,13 +104,6 @@ def test_run_that_ended_early_has_no_diagnosis(tmp_path: Path) -> None:
     run(interrupt)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["failure"] == f"interrupted after 4 of {FRAMES} frames" and metrics["diagnosis"] is None
-
-
-class StoredWall(Wall):
-    """The wall as an `RGBDSequence`, whose images the diagnosis reads again."""
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return map(self.__getitem__, range(FRAMES))
 
 
 class Covered(StoredWall):

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from helpers.wall_run import FRAMES, Wall
+from helpers.wall_run import FRAMES, StoredWall, Wall
 
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.errors import InputError
@@ -23,13 +23,6 @@ from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 
 TRACKED, ODOMETRY = TrackingStatus.TRACKED, TrackingStatus.ODOMETRY
 DISCONNECTED, LOST = TrackingStatus.DISCONNECTED, TrackingStatus.LOST
-
-
-class StoredWall(Wall):
-    """The wall as an `RGBDSequence`."""
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        return map(self.__getitem__, range(FRAMES))
 
 
 class LiveWall:

@@ -12,7 +12,13 @@ from rich.console import RenderableType
 from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.summary import format_csv, format_latex, format_markdown, make_live_table, make_screen_tables
+from v3d_torch.evaluation.summary import (
+    format_csv,
+    format_latex,
+    format_markdown,
+    make_progress_table,
+    make_screen_tables,
+)
 from v3d_torch.evaluation.tables import ErrorTable
 from v3d_torch.io.files import write_text
 from v3d_torch.io.parquet_file import write_parquet
@@ -111,14 +117,14 @@ class BatchRecord:
         write_text(self.folder / "summary.csv", format_csv(self.outcomes))
 
     @property
-    def newest_last(self) -> list[Outcome]:
+    def outcomes_newest_last(self) -> list[Outcome]:
         """Outcomes of the jobs that have ended, those of the sequence of the newest one last."""
         ends = {outcome.sequence: end for end, outcome in enumerate(self._outcomes.values())}
         return sorted(self.outcomes, key=lambda outcome: ends[outcome.sequence])
 
-    def live_table(self) -> ErrorTable | None:
+    def progress_table(self) -> ErrorTable | None:
         """Return the table to show while jobs run, the newest rows last; None if there are no errors yet."""
-        return make_live_table(self.newest_last)
+        return make_progress_table(self.outcomes_newest_last)
 
     def screen_tables(self) -> list[RenderableType]:
         """Return the summary as tables for the screen, and their explanations."""

@@ -25,7 +25,7 @@ from v3d_torch.evaluation.summary import (
     format_csv,
     format_latex,
     format_markdown,
-    make_live_table,
+    make_progress_table,
     make_screen_tables,
 )
 from v3d_torch.evaluation.tables import (
@@ -140,9 +140,9 @@ class ReproductionRecord(BatchRecord):
             write_text(self.folder / "ablation.tex", format_latex_document([table], legend))
             write_text(self.folder / "ablation.csv", ablation.format_csv(self._study_outcomes))
 
-    def live_table(self) -> ErrorTable | None:
-        """Return the first of the paper's tables, to show while jobs run; None if there are no errors yet."""
-        return make_live_table(self._select(self.newest_last), self._absent)
+    def progress_table(self) -> ErrorTable | None:
+        """Return the first of the paper's tables, to show while jobs run, the newest rows last; None without errors."""
+        return make_progress_table(self._select(self.outcomes_newest_last))
 
     def screen_tables(self) -> list[RenderableType]:
         """Return the paper's tables and that of the study for the screen, and their explanations."""

@@ -137,7 +137,7 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                         print_line(progress.console, str(outcome))
                         for warning in outcome.warnings:
                             print_line(progress.console, f"warning: {warning}")
-                        if console.is_terminal and (table := record.live_table()) is not None:
+                        if console.is_terminal and (table := record.progress_table()) is not None:
                             show.show_table(table)
                         try:
                             record.write()

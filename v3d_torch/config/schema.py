@@ -68,8 +68,8 @@ class CloudConfig(Section):
 
     stride: int = Field(4, gt=0, le=100)
     """Every n-th row and column of a mask becomes points, which is finer than the network's masks: their cells have 6
-    pixels. Up to 4 m the points of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN. It is
-    scaled to the size of the images, and to a shorter focal length."""
+    pixels by default. Up to 4 m the points of a Kinect are then at most 0.03 m apart, well within the radius of DBSCAN.
+    It is scaled to the size of the images, and to a shorter focal length."""
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points, metres: two standard deviations of the depth of a Kinect are 0.1 m there, as large as
     the motion to detect."""
@@ -131,7 +131,7 @@ class FreeSpaceConfig(Section):
     """
 
     enabled: bool = True
-    """False for the paper's rules of the object stages."""
+    """False for the paper's rules."""
     time_spans: tuple[Annotated[float, Field(ge=0, le=10)], ...] = (0.3, 0.9)
     """Times between the depth images that are compared, seconds: a walking person moves 0.3 m in the first, a slow one
     in the second. Depth images are stored for the longest one."""
@@ -193,7 +193,7 @@ class StaticMaskConfig(Section):
     map can take the pixels beside them from another frame."""
     depth_margin: int = Field(8, ge=0, le=100)
     """Dilation of masks over pixels with the depth of the object or without depth, pixels: a little more than a cell of
-    the network's masks, which has 6 pixels."""
+    the network's masks, which has 6 pixels by default."""
     surface_margin: int = Field(32, ge=0, le=1000)
     """Dilation of masks along a continuous surface, pixels: a hand at 3 m. Larger values also mask more of a table that
     a person touches. 0 turns it off."""
@@ -246,8 +246,8 @@ class OdometryConfig(Section):
     max_hamming: int = Field(64, gt=0, le=256)
     """Maximum Hamming distance of a match, bits of 256."""
     iterations: int = Field(300, gt=0)
-    """Maximum number of RANSAC hypotheses: with a probability of 0.9999 they include 8 pairs without outliers
-    (fundamental matrix) at 35 % outliers, and 3 (P3P) at 66 %."""
+    """Maximum number of RANSAC hypotheses: with a probability of 0.9999 one is a sample of 8 pairs without outliers,
+    for the fundamental matrix, at 35 % outliers. P3P samples fewer pairs and needs fewer hypotheses."""
     min_inliers: int = Field(20, gt=0)
     """Minimum number of inliers: a dozen wrong matches can agree by chance."""
     max_speed: float = Field(5.0, gt=0)

@@ -74,7 +74,7 @@ class StoredSequence(ABC):
     def notes(self) -> list[str]:
         """Sentences about the sequence that a user needs to know before a run."""
         error = self.groundtruth_error
-        return [] if error is None else [f"no ground truth, and so no scores: {error}"]
+        return [] if error is None else [f"the ground truth cannot be read: {error}"]
 
     def __len__(self) -> int:
         return self.stamps.shape[0]

@@ -117,9 +117,9 @@ def format_csv(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
     return text.getvalue()
 
 
-def make_live_table(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> ErrorTable | None:
+def make_progress_table(outcomes: Sequence[Outcome]) -> ErrorTable | None:
     """Return the first table of `make_screen_tables`, to be shown while runs go on; None if nothing was measured."""
-    return next(_screen_error_tables(outcomes, absent), None)
+    return next(_screen_error_tables(outcomes, ()), None)
 
 
 def make_screen_tables(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> list[RenderableType]:

@@ -131,19 +131,19 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
     if int(counts.sum()) != lengths["feature"]:
         return "keyframe/feature_count does not add up to the number of features"
     camera, keyframes, landmarks = sparse_map.camera, lengths["keyframe"], lengths["landmark"]
-    end_octave = octaves_of_levels(sparse_map.features_config, camera.width).stop
+    octaves = octaves_of_levels(sparse_map.features_config, camera.width)
     for name, minimum, end in (
         ("keyframe/part", 0, keyframes),
         ("keyframe/feature_count", 0, lengths["feature"] + 1),
         ("keyframe/reference", 0, keyframes),
         ("feature/pixel", 0, torch.tensor([camera.width, camera.height])),
-        ("feature/octave", 0, end_octave),
+        ("feature/octave", octaves.start, octaves.stop),
         ("feature/landmark", -1, landmarks),
         ("landmark/keyframe", 0, keyframes),
         ("observation/landmark", 0, landmarks),
         ("observation/keyframe", 0, keyframes),
         ("observation/feature", 0, counts[owners.clamp(0, keyframes - 1)] if keyframes else 0),
-        ("observation/octave", 0, end_octave),
+        ("observation/octave", octaves.start, octaves.stop),
         ("feature/sigma_ratio", _MIN_SIGMA_RATIO, torch.inf),
         ("observation/sigma_ratio", _MIN_SIGMA_RATIO, torch.inf),
         ("loop/i", 0, keyframes),
@@ -161,7 +161,7 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
 
 def _are_rigid_motions(T: Tensor) -> bool:
     """Check whether matrices are rigid motions, up to rounding, float64, shape (N, 4, 4)."""
-    is_near = (T - orthonormalise(T)).abs() <= _MOTION_TOLERANCE  # false for NaN, of a singular matrix
+    is_near = (T - orthonormalise(T)).abs() <= _MOTION_TOLERANCE
     return bool(is_near.all() and (torch.linalg.det(T) > 0).all())
 
 

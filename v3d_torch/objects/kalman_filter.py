@@ -23,8 +23,8 @@ and its time constant, seconds: within seconds a person turns, or others walk by
 because masks end at different places."""
 
 _FACTOR_TIME, _FACTOR_PRIOR = 4.0, 5.0
-"""Time constant of the mean of the variance factor, seconds, and weight of the prior that it is 1, in measurements:
-a person walks in the same way for some seconds."""
+"""Time constant of the mean that is the variance factor, seconds, because a person walks in the same way for some
+seconds; and weight of its initial value, 1, in measurements, which decays like theirs."""
 
 _MIN_FACTOR, _MAX_FACTOR = 0.05, 4.0
 """Range of the variance factor: someone who walks evenly can still turn, and a jump of the mask is no motion."""
@@ -41,19 +41,18 @@ class ConstantVelocityKalmanFilter:
     Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec. 8.4), and belongs to the state of
     the filter: as white noise, it would be confused with motion.
 
-    The filter assumes as much noise as there can be, so that ids hold where masks jump and people turn. Most measured
-    positions are much nearer to the prediction. The covariances of velocity and acceleration that users get are
-    therefore multiplied by the variance factor that the measurements show: the mean of the normalised squared
-    innovations (same book, Sec. 5.4), which is 1 if the assumed noise is right. The error of a position comes from the
-    mask, and not from the motion.
+    The filter assumes more noise than most objects have, so that ids hold where masks jump and people turn. For users,
+    the covariances of velocity and acceleration are therefore multiplied by the variance factor that the measurements
+    show: the mean of the normalised squared innovations (same book, Sec. 5.4), which is 1 if the assumed noise is
+    right. The variance of the position is not scaled, because its error is that of the mask.
 
     Args:
         config: Noise and maximum speed.
 
     Attributes:
         state: Estimate for the whole object after the last measurement, see `ObjectState`.
-        visible_state: Estimate for its visible part, with the same velocity, and with the covariance that the
-            measurements show.
+        visible_state: Estimate for its visible part, with the same velocity, whose covariance and acceleration noise
+            are scaled by the variance factor.
     """
 
     def __init__(self, config: TrackerConfig) -> None:

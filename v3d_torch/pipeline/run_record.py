@@ -146,7 +146,7 @@ class ObjectTable(TensorTable):
         return len(self["id"].unique())
 
     def frames_with_masked_objects(self) -> Tensor:
-        """Return the indices of the frames with objects that are not static, which tracking leaves out, int64, (N,)."""
+        """Return the indices of the frames with an object that is not static, masked by default, int64, (N,)."""
         return self["frame"][self["motion_state"] != _MOTION_STATES.index(MotionState.STATIC)].unique()
 
     def count_motion_states(self) -> dict[MotionState, int]:

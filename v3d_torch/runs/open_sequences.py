@@ -62,7 +62,7 @@ def open_sequences(
 ) -> dict[str, RGBDSequence]:
     """Open several sequences in the given order, before the first of them is run; see `load_sequence`.
 
-    All sequences are opened before an error is raised. If several are not valid, a line is printed for each.
+    All sequences are opened before an InputError is raised. If several are not valid, a line is printed for each.
 
     Returns:
         Sequences by their name in tables.
@@ -88,7 +88,7 @@ def open_sequences(
     if len(errors) == 1:
         raise errors[0]
     if errors:
-        console.print("not valid:")
+        console.print("These sequences are not valid:")
         for invalid in errors:
             print_line(console, str(invalid))
         raise InputError(f"{len(errors)} of {len(names)} sequences are not valid, the first: {errors[0]}")
