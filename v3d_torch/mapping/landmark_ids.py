@@ -89,10 +89,9 @@ def find_landmarks_in_use(tables: MapTables, external_ids: Iterable[Tensor] = ()
     Returns:
         Mask of the landmarks, bool, shape :math:`(L,)`.
     """
-    ids = torch.cat([*_stored_ids(tables), *external_ids])
-    in_use = tables.landmarks["active"].clone()
-    in_use[ids[ids >= 0]] = True
-    return in_use
+    in_use = torch.cat([tables.landmarks["active"], torch.tensor([False])])
+    in_use[torch.cat([*_stored_ids(tables), *external_ids])] = True  # the last element is that of no landmark, -1
+    return in_use[:-1]
 
 
 def compacted_ids(in_use: Tensor) -> Tensor:
