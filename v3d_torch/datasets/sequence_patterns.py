@@ -113,10 +113,12 @@ def _match_paths(root: Path, pattern: Path) -> tuple[list[Path], list[Path]]:
 
     Other folders are returned only if there are sequences: else the pattern is meant for another root.
     """
-    is_sequence = {path: is_source(path) for path in sorted(root.glob(str(pattern.relative_to(pattern.anchor))))}
-    sequences = [path for path, is_one in is_sequence.items() if is_one]
-    others = [path for path in is_sequence if not (is_sequence[path] or path.name.startswith(".")) and path.is_dir()]
-    return sequences, others if sequences else []
+    found = sorted(root.glob(str(pattern.relative_to(pattern.anchor))))
+    sequences = [path for path in found if is_source(path)]
+    if not sequences:
+        return [], []
+    others = set(found).difference(sequences)
+    return sequences, sorted(path for path in others if path.is_dir() and not path.name.startswith("."))
 
 
 def _match_names(pattern: str) -> list[str]:

@@ -77,9 +77,8 @@ class ConstantVelocityKalmanFilter:
         if not bool(torch.isfinite(position).all()):
             return
         if self.state.is_known:
-            elapsed = stamp - self.state.stamp
             self._predict(stamp, sigma)
-            self._correct(position, elapsed)
+            self._correct(position)
         else:
             self._start(stamp, position, sigma)
 
@@ -102,7 +101,10 @@ class ConstantVelocityKalmanFilter:
         self._offset_covariances, self._offset_sigma = (-slow, 0.0, slow), sigma
 
     def _predict(self, stamp: float, sigma: float) -> None:
-        """Predict the state; the slow part of the offset decays, and scales with its standard deviation."""
+        """Predict the state. The slow part of the offset decays, and scales with its standard deviation.
+
+        The weights of earlier measurements in the variance factor decay as well.
+        """
         dt, (po, vo, oo) = stamp - self.state.stamp, self._offset_covariances
         correlation = math.exp(-dt / _SLOW_TIME)
         scale = correlation * sigma / self._offset_sigma
@@ -110,15 +112,19 @@ class ConstantVelocityKalmanFilter:
         self._offset = scale * self._offset
         variance = scale**2 * oo + (1 - correlation**2) * _SLOW_FRACTION * sigma**2
         self._offset_covariances, self._offset_sigma = (scale * (po + dt * vo), scale * vo, variance), sigma
+        kept = math.exp(-dt / _FACTOR_TIME)
+        self._squared_innovations, self._measurements = kept * self._squared_innovations, kept * self._measurements
 
-    def _correct(self, measured: Tensor, elapsed: float) -> None:
+    def _correct(self, measured: Tensor) -> None:
         """Correct the predicted state with a measurement: the sum of position, both parts of the offset, and noise."""
         (pp, pv, vv), (po, vo, oo) = self.state.variances, self._offset_covariances
         p, v, o = pp + po, pv + vo, po + oo  # covariances with the measurement
         variance = p + o + (1 - _SLOW_FRACTION) * self._offset_sigma**2 + _CENTROID_SIGMA**2
         innovation = measured - self.state.position - self._offset
         weighted = innovation / variance
-        factor = self._update_factor(float(innovation @ weighted) / len(innovation), elapsed)
+        self._squared_innovations += float(innovation @ weighted) / len(innovation)  # 1 is expected
+        self._measurements += 1
+        factor = min(max(self._squared_innovations / self._measurements, _MIN_FACTOR), _MAX_FACTOR)
         velocity = self.state.velocity + v * weighted
         self.state = replace(
             self.state,
@@ -136,10 +142,3 @@ class ConstantVelocityKalmanFilter:
         )
         self._offset = self._offset + o * weighted
         self._offset_covariances = po - p * o / variance, vo - v * o / variance, oo - o * o / variance
-
-    def _update_factor(self, squared_innovation: float, elapsed: float) -> float:
-        """Add a normalised squared innovation, 1 is expected, and return the variance factor."""
-        kept = math.exp(-elapsed / _FACTOR_TIME)
-        self._squared_innovations = kept * self._squared_innovations + squared_innovation
-        self._measurements = kept * self._measurements + 1
-        return min(max(self._squared_innovations / self._measurements, _MIN_FACTOR), _MAX_FACTOR)
