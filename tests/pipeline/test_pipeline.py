@@ -268,21 +268,27 @@ def test_masks_that_cannot_be_written_end_the_run_with_a_message(tmp_path: Path)
     assert failure is not None and "masks" in failure and "cannot be written" in failure
 
 
-@pytest.mark.parametrize("live", [False, True])
-def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
-    live: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A check takes longer than a frame."""
+def record_checks(pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch, keyframes: int) -> list[int]:
+    """Let the camera be checked after some keyframes; return a list that gets the number of frames at each check."""
     checked: list[int] = []
-    wall = Wall()
-    pipeline = Pipeline(RealtimePlayback(wall) if live else wall, V3DSLAM(wall.camera, square, Config()))
 
     def check(*_: object) -> list[str]:
         checked.append(len(pipeline.slam.poses))
         return []
 
     monkeypatch.setattr("v3d_torch.pipeline.pipeline.check_plausibility", check)
-    monkeypatch.setattr("v3d_torch.pipeline.pipeline._CHECKED_KEYFRAMES", 1)
+    monkeypatch.setattr("v3d_torch.pipeline.pipeline._CHECKED_KEYFRAMES", keyframes)
+    return checked
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
+    live: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A check takes longer than a frame."""
+    wall = Wall()
+    pipeline = Pipeline(RealtimePlayback(wall) if live else wall, V3DSLAM(wall.camera, square, Config()))
+    checked = record_checks(pipeline, monkeypatch, keyframes=1)
     pipeline()
     assert checked == ([] if live else [1])
     pipeline.flush()
@@ -291,20 +297,13 @@ def test_camera_is_checked_during_a_stored_run_and_after_a_live_one(
 
 def test_camera_is_checked_when_its_own_run_has_enough_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Views of a known map can be of another camera, and say nothing about this one."""
-    checked: list[int] = []
     slam = V3DSLAM(CAMERA, square, load_config(overrides=["mapping.max_keyframe_interval=5"]))
     views = StaticViews(CAMERA, slam.config.dense_map.stride)
     for _ in range(3):
         earlier = replace(keyframe(), frame=-1)
         views.add(earlier, Wall()[0].image, Wall()[0].depth, torch.ones(240, 320, dtype=torch.bool))
     pipeline = Pipeline(Wall(), slam, views=views)
-
-    def check(*_: object) -> list[str]:
-        checked.append(len(pipeline.slam.poses))
-        return []
-
-    monkeypatch.setattr("v3d_torch.pipeline.pipeline.check_plausibility", check)
-    monkeypatch.setattr("v3d_torch.pipeline.pipeline._CHECKED_KEYFRAMES", 2)
+    checked = record_checks(pipeline, monkeypatch, keyframes=2)
     pipeline()
     assert checked == [6]  # frames 0 and 5 became keyframes
 
