@@ -231,7 +231,8 @@ class V3DSLAM(FramePreprocessor):
             instances = self._complete_instances(segmentation.instances, view, newly_occupied)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
-            appearance = self.describe_appearance(frame.image, clouds.cloud_pixels)
+            is_propagated = instances.track_ids is not None  # by ids, so that appearance is not compared
+            appearance = None if is_propagated else self.describe_appearance(frame.image, clouds.cloud_pixels)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))
             objects = self.classify_motion(instances, clouds, view, newly_occupied, support, appearance)

@@ -151,12 +151,15 @@ class Instances:
         labels: COCO class index (0 = person, 0..79; -1 = unlabelled), int64, shape :math:`(N,)`.
         scores: Confidence in [0, 1], float32, shape :math:`(N,)`.
         boxes: Left, top, right and bottom edge, pixels, float32, shape :math:`(N, 4)`.
+        track_ids: ID of the track that each instance continues, 0 if it is not known, int64, shape :math:`(N,)`; None
+            if none is known, as from a segmenter.
     """
 
     masks: Tensor
     labels: Tensor
     scores: Tensor
     boxes: Tensor
+    track_ids: Tensor | None = None
 
     def __len__(self) -> int:
         return self.labels.shape[0]
@@ -165,18 +168,26 @@ class Instances:
         """Select instances by a boolean mask; returns self when everything is selected, to avoid copying masks."""
         if bool(selected.all()):
             return self
-        return Instances(self.masks[selected], self.labels[selected], self.scores[selected], self.boxes[selected])
+        track_ids = None if self.track_ids is None else self.track_ids[selected]
+        masks, boxes = self.masks[selected], self.boxes[selected]
+        return Instances(masks, self.labels[selected], self.scores[selected], boxes, track_ids)
 
     def concatenate(self, others: Instances) -> Instances:
         """Return these instances followed by others; returns self if there are no others."""
         if len(others) == 0:
             return self
+        is_known = self.track_ids is not None or others.track_ids is not None
         return Instances(
             masks=torch.cat([self.masks, others.masks]),
             labels=torch.cat([self.labels, others.labels]),
             scores=torch.cat([self.scores, others.scores]),
             boxes=torch.cat([self.boxes, others.boxes]),
+            track_ids=torch.cat([self._known_ids(), others._known_ids()]) if is_known else None,
         )
+
+    def _known_ids(self) -> Tensor:
+        """Return the track IDs, all 0 if none is known."""
+        return torch.zeros_like(self.labels) if self.track_ids is None else self.track_ids
 
     @staticmethod
     def empty(height: int, width: int) -> Instances:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers.boards import CAMERA, CHAIR, CLOUDS, DOG, HERE, PERSON, Board, BoardTracker, render
@@ -49,6 +51,7 @@ def test_masks_follow_a_moving_and_a_standing_object_and_furniture(rate: float) 
     track_boards = walk(rate)
     found, truth = propagate(track_boards, [Board(-0.6 + SPEED * 6 / rate), STANDING, FURNITURE])
     assert found.labels.tolist() == [PERSON, PERSON, CHAIR]
+    assert found.track_ids is not None and found.track_ids.tolist() == [1, 2, 3]
     assert found.scores.tolist() == [0.0] * 3 and found.boxes.shape == (3, 4)
     assert float(intersection_over_union(found.masks, truth.masks).min()) > 0.85
 
@@ -115,6 +118,23 @@ def test_furniture_votes_in_frames_with_and_without_segmentation() -> None:
         result = stage(frame / 10, instances if frame % 2 == 0 else None, depth, HERE)
         assert [(obj.id, obj.label) for obj in result.objects] == [(1, PERSON), (2, CHAIR), (3, CHAIR)]
         assert result.vote_pairs == ([(2, 1), (3, 1)] if frame > 0 else [])
+
+
+def test_propagated_instances_continue_their_tracks_wherever_they_are() -> None:
+    track_boards = walk()
+    depth, truth = render([Board(-0.6 + SPEED * 6 / 30), STANDING, FURNITURE])
+    swapped = replace(truth, track_ids=torch.tensor([2, 1, 3]))
+    masks = {track.id: track.mask for track in track_boards.track(depth, swapped, 6 / 30)}
+    assert list(masks) == [1, 2, 3]
+    assert torch.equal(masks[2], truth.masks[0]) and torch.equal(masks[1], truth.masks[1])
+
+
+def test_instances_beside_propagated_ones_are_matched_to_the_other_tracks() -> None:
+    track_boards = walk()
+    depth, truth = render([Board(-0.6 + SPEED * 6 / 30), STANDING, FURNITURE])
+    tracks = track_boards.track(depth, replace(truth, track_ids=torch.tensor([0, 2, 0])), 6 / 30)
+    assert [(track.id, track.missed) for track in tracks] == [(1, False), (2, False), (3, False)]
+    assert all(torch.equal(track.mask, mask) for track, mask in zip(tracks, truth.masks, strict=True))
 
 
 def test_no_tracks_give_no_instances() -> None:

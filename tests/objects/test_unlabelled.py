@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -153,6 +155,19 @@ def test_labelled_and_unlabelled_instances_are_concatenated_in_order() -> None:
         assert torch.equal(one[:1], first) and torch.equal(one[1:], second) and one.dtype == first.dtype
     assert len(NO_INSTANCES.concatenate(unlabelled)) == len(unlabelled.concatenate(NO_INSTANCES)) == 1
     assert len(NO_INSTANCES.concatenate(NO_INSTANCES)) == 0
+
+
+def test_ids_of_propagated_instances_stay_with_them() -> None:
+    propagated = replace(person(rectangle(slice(0, 40), slice(0, 40))), track_ids=torch.tensor([7]))
+    unlabelled = propose(newly_occupied(REGION))
+    assert unlabelled.track_ids is None and unlabelled.concatenate(unlabelled).track_ids is None
+    for joined, expected in (
+        (propagated.concatenate(unlabelled), [7, 0]),
+        (unlabelled.concatenate(propagated), [0, 7]),
+    ):
+        assert joined.track_ids is not None and joined.track_ids.tolist() == expected
+        last = joined[torch.tensor([False, True])].track_ids
+        assert last is not None and last.tolist() == expected[1:]
 
 
 def test_class_names_include_unlabelled() -> None:

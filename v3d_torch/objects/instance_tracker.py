@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import torch
@@ -56,11 +56,11 @@ class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
     The instances of a frame continue tracks in four stages, each an optimal assignment: first confirmed tracks, then
-    those without masks, then new ones that are not confirmed yet; instances without a class continue what is left. If
-    an object is not detected any more and may move, its mask is predicted for a short time. An object that does not
-    move has no mask in this time, because tracking uses its pixels; it is called resting. Then both are lost: they keep
-    their ids for some seconds, in case they were hidden or out of view. The state (tracks and next id) is part of
-    ``state_dict()``.
+    those without masks, then new ones that are not confirmed yet; instances without a class continue what is left. An
+    instance that was propagated continues the track from which it comes. If an object is not detected any more and may
+    move, its mask is predicted for a short time. An object that does not move has no mask in this time, because
+    tracking uses its pixels; it is called resting. Then both are lost: they keep their ids for some seconds, in case
+    they were hidden or out of view. The state (tracks and next id) is part of ``state_dict()``.
 
     Args:
         config: Gates and times.
@@ -137,8 +137,10 @@ class InstanceTracker(torch.nn.Module):
         camera, stride = self._camera, self._stride
         compared = appearance if self._config.compare_appearance else None
         detected = detect_instances(stamp, instances, clouds, compared, T_wc, stride)
-        predicted = predict_tracks(self.tracks, stamp, depth, invert(T_wc), camera, self._clouds, stride)
-        matches = self._match(predicted, detected)
+        matches = self._continued_tracks(instances)
+        others = [track for track in self.tracks if track not in matches.values()]
+        predicted = predict_tracks(others, stamp, depth, invert(T_wc), camera, self._clouds, stride)
+        matches |= self._match(predicted, detected, matches)
 
         # Update matched tracks, and start a track for each instance without a match, unless it shows a matched object.
         updated: list[Track] = []
@@ -194,21 +196,40 @@ class InstanceTracker(torch.nn.Module):
                 track.apply_world_correction(T_map_guess, self.comparable_since)
         self._is_guess = False
 
-    def _match(self, predicted: PredictedTracks, detected: DetectedInstances) -> dict[int, Track]:
-        """Match instances to tracks in stages; return the track of each instance that continues one, by its index."""
+    def _continued_tracks(self, instances: Instances) -> dict[int, Track]:
+        """Return the track of each instance of which it is known, by its index."""
+        if instances.track_ids is None:
+            return {}
+        tracks = {track.id: track for track in self.tracks}
+        return {i: tracks[track_id] for i, track_id in enumerate(instances.track_ids.tolist()) if track_id > 0}
+
+    def _match(
+        self, predicted: PredictedTracks, detected: DetectedInstances, matched: Collection[int]
+    ) -> dict[int, Track]:
+        """Match instances to tracks in stages.
+
+        Args:
+            predicted: Tracks to match.
+            detected: Instances.
+            matched: Indices of instances whose track is known.
+
+        Returns:
+            Track of each other instance that continues one, by its index.
+        """
         matches: dict[int, Track] = {}
-        if len(detected) == 0:
+        if len(detected) == len(matched):
             return matches
+        tracks = predicted.tracks
         labelled = detected.labels != UNLABELLED
         evidence = _compare(predicted, detected, self._config)
-        named = torch.tensor([track.label != UNLABELLED for track in self.tracks], dtype=torch.bool)
-        confirmed = named & torch.tensor([track.is_confirmed for track in self.tracks], dtype=torch.bool)
-        free_instances = torch.ones(len(detected), dtype=torch.bool)
-        free_tracks = torch.ones(len(self.tracks), dtype=torch.bool)
+        named = torch.tensor([track.label != UNLABELLED for track in tracks], dtype=torch.bool)
+        confirmed = named & torch.tensor([track.is_confirmed for track in tracks], dtype=torch.bool)
+        free_instances = torch.tensor([j not in matched for j in range(len(detected))])
+        free_tracks = torch.ones(len(tracks), dtype=torch.bool)
 
         def assign(rows: Tensor, columns: Tensor) -> None:
             for i, j in _assign(evidence, rows & free_tracks, columns & free_instances):
-                matches[j] = self.tracks[i]
+                matches[j] = tracks[i]
                 free_tracks[i], free_instances[j] = False, False
 
         assign(confirmed, labelled)

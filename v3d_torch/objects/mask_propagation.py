@@ -3,13 +3,15 @@
 Segmentation of every second frame halves the largest cost of a frame. In the frame between, the track of an object
 predicts its points, and the depth image gives its outline: the pixels near the predicted points that have the depth of
 these points. Objects of propagated masks are measured like objects of network masks, so that centroids, votes and
-Chamfer distances come from the depth of the frame and not from a prediction. An object without a centroid, for example
-because it is too far for its depth, has no points to project, or few: it keeps its last mask where nothing is measured.
+Chamfer distances come from the depth of the frame and not from a prediction; only the ids are known before. An object
+without a centroid, for example because it is too far for its depth, has no points to project, or few: it keeps its last
+mask where nothing is measured.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -40,7 +42,7 @@ def propagate_instances(
         config: Spacing and maximum depth of the points of the tracks.
 
     Returns:
-        Instances with the classes of the tracks, score 0 and empty boxes.
+        Instances with the IDs and classes of the tracks, score 0 and empty boxes.
     """
     detected = [track for track in tracks if not track.missed and track.label != UNLABELLED]
     projected = silhouettes(predict_clouds(detected, view.stamp, view.T_cw), camera, config.voxel_size)
@@ -52,8 +54,8 @@ def propagate_instances(
     }
     if not masks:
         return Instances.empty(*view.depth.shape[-2:])
-    labels = torch.tensor([track.label for track in masks])
-    return Instances.from_masks(torch.stack([*masks.values()]), labels)
+    labels, track_ids = torch.tensor([[track.label, track.id] for track in masks]).T
+    return replace(Instances.from_masks(torch.stack([*masks.values()]), labels), track_ids=track_ids)
 
 
 def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float, *, step: int = 1) -> Tensor:

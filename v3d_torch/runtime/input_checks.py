@@ -122,6 +122,11 @@ def check_instances(instances: Instances, frame: RGBDFrame, labels: range) -> No
         shape = fill_in(dimensions, sizes)
         if (wrong := describe_wrong_tensor(getattr(instances, name), shape, dtype)) is not None:
             raise ConfigError(f"the segmenter's {name} for frame {frame.index} are {wrong}")
+    if instances.track_ids is not None:
+        raise ConfigError(
+            f"the segmenter's track_ids for frame {frame.index} are set; leave them None, because the tracker of the"
+            " objects assigns the ids"
+        )
     unknown = [label for label in instances.labels.tolist() if label not in labels]
     if unknown:
         raise ConfigError(
