@@ -35,7 +35,7 @@ def with_dots(dots: dict[tuple[int, int], int]) -> Image:
 
 def detect(image: Image, boxes: NDArray[np.int64] = WHOLE) -> dict[tuple[int, int], int]:
     """Strength of each corner (column, row)."""
-    corners, strength = detect_corners(image, boxes, THRESHOLD, MIN_THRESHOLD, CELL)
+    corners, strength, _ = detect_corners(image, boxes, THRESHOLD, MIN_THRESHOLD, CELL)
     assert corners.shape == (len(strength), 2)
     return dict(zip(map(tuple, corners.tolist()), strength.tolist(), strict=True))
 
@@ -55,7 +55,7 @@ def test_corners_of_one_threshold_are_those_of_opencv() -> None:
     """OpenCV removes both of two equal neighbours, and returns the largest threshold at which a pixel is a corner."""
     image = photograph("coffee")[1].numpy()
     height, width = image.shape
-    corners, strength = detect_corners(image, np.array([[3, 3, width - 3, height - 3]]), 20, 20, CELL)
+    corners, strength, _ = detect_corners(image, np.array([[3, 3, width - 3, height - 3]]), 20, 20, CELL)
     found = {(int(x), int(y)): s for (x, y), s in zip(corners.tolist(), strength.tolist(), strict=True)}
     others = cv2.FastFeatureDetector.create(20, nonmaxSuppression=True).detect(image)
     expected = {(int(point.pt[0]), int(point.pt[1])): int(point.response) + 1 for point in others}
@@ -81,8 +81,28 @@ def test_the_first_of_equal_neighbours_is_the_corner() -> None:
     assert detect(image) == {(20, 20): 30, (40, 30): 30, (61, 21): 30}
 
 
+def test_maximum_between_pixels_is_that_of_the_parabola() -> None:
+    """A dot has its contrast as strength; a neighbour that is as bright as the arc of the dot has the difference."""
+    image = with_dots({(30, 20): 40, (31, 20): 30, (30, 19): 20, (60, 40): 25})
+    corners, strength, offsets = detect_corners(image, WHOLE, THRESHOLD, MIN_THRESHOLD, CELL)
+    assert corners.tolist() == [[30, 20], [60, 40]] and strength.tolist() == [40, 25]
+    np.testing.assert_allclose(offsets, [[30 / (2 * (80 - 30)), -20 / (2 * (80 - 20))], [0, 0]])
+
+
+@given(st.integers(0, 1000), st.integers(1, 150))
+def test_maximum_between_pixels_is_within_half_a_pixel(seed: int, contrast: int) -> None:
+    _, _, offsets = detect_corners(noise(seed, contrast), WHOLE, THRESHOLD, MIN_THRESHOLD, CELL)
+    assert (np.abs(offsets) <= 0.5).all()
+
+
+def test_pixels_outside_of_the_boxes_have_no_strength() -> None:
+    image = with_dots({(30, 20): 40, (31, 20): 30})
+    _, _, offsets = detect_corners(image, np.array([[3, 3, 31, 61]]), THRESHOLD, MIN_THRESHOLD, CELL)
+    assert offsets.tolist() == [[0, 0]]
+
+
 def test_corners_are_sorted_by_rows() -> None:
-    corners, _ = detect_corners(noise(0, 60), WHOLE, THRESHOLD, MIN_THRESHOLD, CELL)
+    corners, _, _ = detect_corners(noise(0, 60), WHOLE, THRESHOLD, MIN_THRESHOLD, CELL)
     assert len(corners) > 10
     assert (np.diff(corners @ [1, 96]) > 0).all()
 

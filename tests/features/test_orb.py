@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import cv2
 import kornia_rs
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ import torch
 from helpers.photographs import photograph
 
 from v3d_torch.config import Config, FeaturesConfig
+from v3d_torch.features.features import Features
 from v3d_torch.features.orb import ORB
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -79,6 +83,38 @@ def test_features_of_all_levels_lie_at_the_same_point(scale: int, first_octave: 
         inside = (features.uv[features.octave == octave] - torch.tensor([299.5, 199.5])) / 1.2**octave
         assert (inside[:, 0] - inside[:, 1]).abs().max() < 3.5
         assert inside.abs().max() < 4.5
+
+
+def test_positions_are_accurate_to_a_fraction_of_a_pixel() -> None:
+    """Two images of half the size, blurred as by a lens, whose pixels lie half a pixel apart."""
+    photo = cv2.GaussianBlur(photograph("coffee").permute(1, 2, 0).numpy(), (0, 0), 2.0)
+    height, width = (size // 2 - 1 for size in photo.shape[:2])
+    orb = ORB(FeaturesConfig(count=1000), PinholeCamera(500.0, 500.0, width / 2, height / 2, width, height))
+    first, second = (
+        orb(
+            torch.from_numpy(
+                cv2.resize(
+                    photo[start : start + 2 * height, start : start + 2 * width],
+                    (width, height),
+                    interpolation=cv2.INTER_AREA,
+                )
+            ).permute(2, 0, 1),
+            torch.ones(1, height, width),
+        )
+        for start in (0, 1)
+    )
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(
+        first.descriptors.numpy(), second.descriptors.numpy()
+    )
+    i, j = torch.tensor([(each.queryIdx, each.trainIdx) for each in matches]).T
+    finest = (first.octave[i] == 0) & (second.octave[j] == 0)
+    i, j = i[finest], j[finest]
+
+    def median_error(position: Callable[[Features], torch.Tensor]) -> float:
+        return float((position(first)[i] - position(second)[j] - 0.5).norm(dim=1).median())
+
+    assert len(i) > 100
+    assert median_error(lambda features: features.uv) < 0.6 * median_error(lambda features: features.pixel.double())
 
 
 def test_features_are_found_at_low_contrast() -> None:

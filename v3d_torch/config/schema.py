@@ -290,8 +290,9 @@ class TrackingConfig(Section):
     0.0014 (Khoshelham and Elberink, Sensors 2012), but corners lie on depth edges, and colour and depth are neither
     simultaneous nor perfectly registered. It equals ORB-SLAM2's setting: a pixel of disparity at a baseline of 40 pixel
     metres."""
-    pixel_sigma: float = Field(1.0, gt=0)
-    """Standard deviation of the position of a feature at octave 0, pixels."""
+    pixel_sigma: float = Field(0.7, gt=0)
+    """Standard deviation of the position of a feature at octave 0, pixels. In sharp images it is a third of a pixel;
+    blur and changes of perspective add to it."""
     min_inliers: int = Field(20, gt=0)
     """Minimum number of landmarks found; with fewer the camera is lost."""
     local_keyframes: int = Field(15, gt=0)

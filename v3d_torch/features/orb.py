@@ -66,13 +66,13 @@ class ORB:
         pixels = brighten(image).permute(1, 2, 0).contiguous().numpy()
         grey = np.asarray(kornia_rs.imgproc.gray_from_rgb(pixels))[..., 0]
         canvas = self._pyramid.build(grey)
-        corners, level = self._detect(canvas)
+        corners, offsets, level = self._detect(canvas)
         smoothed = kornia_rs.imgproc.gaussian_blur(canvas[..., None], _SMOOTHING_SIZE, _SMOOTHING_SIGMA)[..., 0]
         descriptors = brief.describe(*map(torch.from_numpy, (canvas, smoothed, corners)))
         # Pixel centres lie at integers, so the image borders lie at half-integers.
         ratio = (self._camera.width, self._camera.height) / np.array(self._pyramid.sizes)
         corners[:, 1] -= self._pyramid.tops[level]
-        position = torch.from_numpy((corners + 0.5) * ratio[level] - 0.5)
+        position = torch.from_numpy((corners + offsets + 0.5) * ratio[level] - 0.5)
         pixel = position.round().to(torch.int64)
         return Features(
             uv=self._camera.undistort(position),
@@ -82,11 +82,16 @@ class ORB:
             descriptors=descriptors,
         )
 
-    def _detect(self, canvas: NDArray[np.uint8]) -> tuple[Ints, Ints]:
-        """Return the corners (column, row) in the image of all levels, (N, 2), and the level of each, sorted, (N,)."""
+    def _detect(self, canvas: NDArray[np.uint8]) -> tuple[Ints, NDArray[np.float64], Ints]:
+        """Detect corners in the image of all levels.
+
+        Returns:
+            Corners (column, row), (N, 2), their offsets to a fraction of a pixel, (N, 2), and the level of each,
+            sorted, (N,).
+        """
         pyramid = self._pyramid
-        corners, strength = detect_corners(canvas, pyramid.boxes, _THRESHOLD, _MIN_THRESHOLD, _CELL)
+        corners, strength, offsets = detect_corners(canvas, pyramid.boxes, _THRESHOLD, _MIN_THRESHOLD, _CELL)
         level = pyramid.level_of_row[corners[:, 1]]
         in_level = corners - np.stack([np.zeros_like(level), pyramid.tops[level]], axis=1)
         selected = select_corners(in_level, strength, level, pyramid.sizes, self._counts)
-        return corners[selected], level[selected]
+        return corners[selected], offsets[selected], level[selected]

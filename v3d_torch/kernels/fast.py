@@ -84,8 +84,17 @@ def _raise(row: Image, maximum: Image) -> None:
         maximum[x] = max(maximum[x], row[x])
 
 
+@device
+def _peak_offset(before: np.uint8, centre: np.uint8, after: np.uint8) -> float:
+    """Offset of the maximum of the parabola through the strength of three adjacent pixels, from the centre, pixels."""
+    a, b, c = np.int64(before), np.int64(centre), np.int64(after)
+    return (c - a) / (2 * (2 * b - a - c))
+
+
 @kernel("(u1[:,::1], i8[:,::1], i8, i8, i8)")
-def detect_corners(image: Image, boxes: Ints, threshold: int, min_threshold: int, cell: int) -> tuple[Ints, Ints]:
+def detect_corners(
+    image: Image, boxes: Ints, threshold: int, min_threshold: int, cell: int
+) -> tuple[Ints, Ints, NDArray[np.float64]]:
     """Detect corners: strong ones, and weak ones in cells without a strong one.
 
     Args:
@@ -97,11 +106,12 @@ def detect_corners(image: Image, boxes: Ints, threshold: int, min_threshold: int
         cell: Side of a cell, pixels.
 
     Returns:
-        Corners (column, row), (N, 2), and their strength, (N,).
+        Corners (column, row), (N, 2), their strength, (N,), and the offsets of the maxima of the strength, (N, 2).
     """
     width = image.shape[1]
     # Two local maxima are never adjacent.
     found, strengths, count = np.empty(image.size // 4, np.int32), np.empty(image.size // 4, np.uint8), 0
+    offsets = np.empty((image.size // 4, 2), np.float64)
     strength = np.empty((cell + 2, width), np.uint8)  # of a row of cells, and of the rows above and below
     strongest, limit, maxima = np.empty(width, np.uint8), np.empty(width, np.uint8), np.empty(width, np.uint8)
     for left, top, right, bottom in boxes:
@@ -128,8 +138,10 @@ def detect_corners(image: Image, boxes: Ints, threshold: int, min_threshold: int
                 for x in range(left, right):
                     if maxima[x]:
                         found[count], strengths[count] = (begin + i - 1) * width + x, maxima[x]
+                        offsets[count, 0] = _peak_offset(strength[i, x - 1], maxima[x], strength[i, x + 1])
+                        offsets[count, 1] = _peak_offset(strength[i - 1, x], maxima[x], strength[i + 1, x])
                         count += 1
     corners = np.empty((count, 2), np.int64)
     for i in range(count):
         corners[i, 1], corners[i, 0] = divmod(found[i], width)
-    return corners, strengths[:count].astype(np.int64)
+    return corners, strengths[:count].astype(np.int64), offsets[:count].copy()
