@@ -360,7 +360,7 @@ def test_view_is_not_compared_with_itself() -> None:
 def test_disabled_check_compares_nothing() -> None:
     newly_occupied = check_with(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
     assert newly_occupied.appeared.shape == (0, 30, 40)
-    assert newly_occupied.fractions([torch.ones(120, 160, dtype=torch.bool)], 1).shape == (1, 0)
+    assert newly_occupied.fractions([torch.ones(120, 160, dtype=torch.bool)], 1, [False]).shape == (1, 0)
 
 
 def test_view_with_guessed_pose_is_not_compared() -> None:
@@ -454,20 +454,25 @@ def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> No
 
 @settings(max_examples=50)
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 5), st.integers(1, 40))
-def test_fraction_of_an_object_is_the_mean_of_its_known_pixels(
+def test_fraction_of_an_object_is_that_of_its_known_or_of_all_its_pixels(
     seed: int, rows: int, stride: int, min_pixels: int
 ) -> None:
     rng = np.random.default_rng(seed)
     appeared = rng.choice([0.0, 1.0, np.nan], (rows, 7, 9), p=[0.3, 0.2, 0.5])
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
+    of_all = [bool(rng.random() < 0.5) for _ in masks]
     fractions = NewlyOccupied(torch.from_numpy(appeared), stride).fractions(
-        [torch.from_numpy(mask) for mask in masks], min_pixels
+        [torch.from_numpy(mask) for mask in masks], min_pixels, of_all
     )
     assert fractions.dtype == torch.float64 and fractions.shape == (3, rows)
-    for row, mask in zip(fractions, masks, strict=True):
+    for row, mask, whole in zip(fractions, masks, of_all, strict=True):
         within = [[appeared[b, v, u] for v, u in np.ndindex(7, 9) if mask[v * stride, u * stride]] for b in range(rows)]
         known = [[value for value in values if not math.isnan(value)] for values in within]
-        expected = [sum(values) / len(values) if len(values) >= min_pixels else math.nan for values in known]
+        totals = [len(all_) if whole else len(values) for all_, values in zip(within, known, strict=True)]
+        expected = [
+            sum(values) / total if len(values) >= min_pixels else math.nan
+            for values, total in zip(known, totals, strict=True)
+        ]
         torch.testing.assert_close(row, torch.tensor(expected).double(), equal_nan=True, rtol=1e-6, atol=0)
 
 
@@ -476,9 +481,9 @@ def test_fraction_of_half_a_box_is_one_half() -> None:
     newly_occupied = check_with(view(at=0.0))(view(WITH_BOX, at=0.3))
     mask = torch.zeros(120, 160, dtype=torch.bool)
     mask[40:80, 60:140] = True
-    (fractions,) = newly_occupied.fractions([mask], CONFIG.min_points)
+    (fractions,) = newly_occupied.fractions([mask], CONFIG.min_points, [False])
     assert fractions[0] == 0.5 and fractions[1].isnan()
-    assert newly_occupied.fractions([mask], 201)[0, 0].isnan()
+    assert newly_occupied.fractions([mask], 201, [False])[0, 0].isnan()
 
 
 # ---------------------------------------------------------------- state

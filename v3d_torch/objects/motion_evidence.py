@@ -17,6 +17,7 @@ from v3d_torch.objects.intra_object_motion import intra_object_motion
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.objects.voting import vote_with_free_space
+from v3d_torch.segmentation.coco import RIGID
 
 MOVED_FRACTION = 0.5
 """Minimum fraction of the visible points of a moved object that appeared or vacated: contours and partial occlusion
@@ -101,7 +102,10 @@ def free_space_evidence(
         config: Tolerances.
         camera: Camera of the frame.
     """
-    appeared = newly_occupied.fractions([track.cloud_pixels for track in tracks], config.min_points)
+    # The known pixels of furniture beside a moving person can be those of the person only, because network masks are
+    # coarse. What cannot move by itself has moved only if most of it is known to have appeared.
+    of_all = [track.label in RIGID for track in tracks]
+    appeared = newly_occupied.fractions([track.cloud_pixels for track in tracks], config.min_points, of_all)
     previous = list(dict.fromkeys(earlier for of_time_span in pairs.values() for earlier, _ in of_time_span.values()))
     vacated = vacated_fractions([detection.cloud for detection in previous], view, camera, config)
     return FreeSpaceEvidence(

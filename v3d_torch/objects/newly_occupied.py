@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.packed_masks import count_common_pixels, pack_masks
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,14 @@ class NewlyOccupied:
         """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
         return (self.appeared == 0).any(dim=0) & ~(self.appeared == 1).any(dim=0)
 
-    def fractions(self, masks: Sequence[Tensor], min_pixels: int) -> Tensor:
+    def fractions(self, masks: Sequence[Tensor], min_pixels: int, of_all: Sequence[bool]) -> Tensor:
         """Return the fraction of each object's pixels that appeared.
 
         Args:
             masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
             min_pixels: Minimum number of known pixels of an object.
+            of_all: True for the objects whose fraction is that of all pixels, false for those whose fraction is that of
+                the known pixels; K elements.
 
         Returns:
             Fraction for each object and time span, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
@@ -46,4 +48,5 @@ class NewlyOccupied:
         indicators = pack_masks(torch.cat([self.appeared == 1, ~self.appeared.isnan()]))
         counts = count_common_pixels(inside, indicators).to(torch.float64)
         new, known = counts[:, :rows], counts[:, rows:]
-        return (new / known).masked_fill(known < min_pixels, torch.nan)
+        total = torch.where(torch.tensor(of_all)[:, None], count_pixels(inside)[:, None], known)
+        return (new / total).masked_fill(known < min_pixels, torch.nan)
