@@ -31,15 +31,27 @@ def depth_of(*surfaces: tuple[slice, slice, float]) -> Tensor:
 
 
 def refine(
-    depth: Tensor, appeared: Tensor | None = None, *, missed: bool = False, cloud_end: int = CUT, **mask: float
+    depth: Tensor,
+    appeared: Tensor | None = None,
+    *,
+    missed: bool = False,
+    cloud_end: int = CUT,
+    beside: int = 0,
+    **mask: float,
 ) -> Tensor:
-    """Return the refined mask of the body; the mask of the network has the upper part only, the cloud can have more."""
+    """Return the refined mask of the body.
+
+    The mask of the network has the upper part only, and some columns ``beside`` it, whose depth is not in the cloud;
+    the cloud can have more rows.
+    """
     segmented = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     segmented[ROWS.start : CUT, COLUMNS] = True
     seen = torch.zeros_like(segmented)
     seen[ROWS.start : cloud_end, COLUMNS] = True
     cloud = (CAMERA.rays * depth[0][..., None])[seen & (depth[0] > 0)][::5]
-    track = Track(1, 0.0, TrackerConfig(), segmented, segmented & (depth[0] > 0), pack_masks(segmented), missed=missed)
+    pixels = segmented & (depth[0] > 0)
+    segmented[ROWS.start : CUT, COLUMNS.stop : COLUMNS.stop + beside] = True
+    track = Track(1, 0.0, TrackerConfig(), segmented, pixels, pack_masks(segmented), missed=missed)
     track.add_detection(Detection3D(0.0, cloud.mean(dim=0).to(torch.float64), cloud))
     if appeared is None:
         appeared = torch.full((1, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
@@ -132,3 +144,21 @@ def test_concave_edge_ends_the_growth() -> None:
         depth[0, edge : ROWS.stop, COLUMNS] = (1 / (1 / BODY + slope))[:, None]
         assert rows_below_cut(refine(depth, **lenient)) <= max(edge - CUT, 0) + STEP
     assert rows_below_cut(refine(depth_of(), **lenient)) == ROWS.stop - CUT
+
+
+def test_second_body_in_the_mask_is_kept_unless_its_surface_was_there_before() -> None:
+    """The network draws one mask over the body and another one behind it, which is not in the cloud."""
+    width = 40
+    behind = (ROWS, slice(COLUMNS.stop, COLUMNS.stop + width), 3.0)
+    refined = refine(depth_of(behind), beside=width, surface_margin=0)
+    second = slice(ROWS.start, CUT), slice(COLUMNS.stop, COLUMNS.stop + width)
+    assert refined[second].double().mean() > 0.9
+    appeared = torch.zeros(1, CAMERA.height // STEP, CAMERA.width // STEP, dtype=torch.float64)
+    assert refine(depth_of(behind), appeared, beside=width, surface_margin=0)[second].double().mean() < 0.1
+    appeared[:] = 1.0
+    assert refine(depth_of(behind), appeared, beside=width, surface_margin=0)[second].double().mean() > 0.9
+
+
+def test_narrow_background_along_the_contour_of_a_mask_is_not_kept() -> None:
+    refined = refine(depth_of(), beside=10, surface_margin=0, depth_margin=0)
+    assert not refined[ROWS.start : CUT, COLUMNS.stop + STEP :].any()

@@ -22,7 +22,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.objects.free_space_check import DepthView
-from v3d_torch.objects.mask_ops import dilate, upsample_nearest
+from v3d_torch.objects.mask_ops import dilate, ellipse, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
@@ -31,6 +31,9 @@ from v3d_torch.objects.track import Track, predict_clouds
 _TOLERANCE_GROWTH = 0.01
 """Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
 depth of a structured-light camera."""
+
+_MIN_PART_RADIUS = 8
+"""Minimum radius of a part of a mask that is kept because its surface is not known, pixels."""
 
 
 class MaskRefiner:
@@ -94,7 +97,21 @@ class MaskRefiner:
         agreeing &= dilate(track.mask, config.depth_margin).numpy()
         mask |= agreeing
         mask |= track.cloud_pixels.numpy()
+        mask |= self._unknown_parts(track, mask)
         return torch.from_numpy(mask)
+
+    def _unknown_parts(self, track: Track, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the parts of the network's mask beyond the refined mask whose surface was not there before, (H, W).
+
+        A network sometimes draws one mask over two people; the second one is not known background.
+        """
+        step = self._stride
+        left = track.mask.numpy() & ~mask & ~self._view.missing.numpy()
+        cells = left[::step, ::step] & ~self._newly_occupied.previously_occupied.numpy()
+        # Contours are coarse: narrow parts along them are background that was not observed before.
+        kernel = ellipse(max(_MIN_PART_RADIUS // step, 1))
+        parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
+        return left & upsample_nearest(parts, step, left.shape).numpy()
 
     def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
         """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (H, W)."""
