@@ -405,8 +405,13 @@ def test_standing_person_is_unknown_before_static(rate: float) -> None:
 
 
 @pytest.mark.parametrize(("fitting", "motion_state"), [(1.0, MotionState.STATIC), (0.2, MotionState.UNKNOWN)])
-def test_person_with_supporting_features_is_static(fitting: float, motion_state: MotionState) -> None:
-    """Rotated furniture over most of the image: in the first frame, only the features on it are evidence."""
+def test_person_with_supporting_features_is_static_after_a_third_of_a_second(
+    fitting: float, motion_state: MotionState
+) -> None:
+    """Rotated furniture over most of the image: the features on it are evidence before the free-space check is.
+
+    A person who walks slowly or towards the camera has features that fit between two frames.
+    """
     depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
     mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
     mask[:, :, : 3 * CAMERA.width // 4] = True
@@ -418,8 +423,26 @@ def test_person_with_supporting_features_is_static(fitting: float, motion_state:
     fits[on_person] &= torch.rand(int(on_person.sum()), generator=torch.Generator().manual_seed(1)) < fitting
     stage = ObjectStage(ObjectsConfig())
     stage.feature_support = FeatureSupport(pixel, fits)
-    (obj,) = stage(0.0, person, depth, HERE).objects
+    for frame in range(9):
+        (obj,) = stage(frame / 30, person, depth, HERE).objects
+        assert obj.motion_state is MotionState.UNKNOWN
+    (obj,) = stage(9 / 30, person, depth, HERE).objects
     assert obj.motion_state is motion_state
+
+
+@pytest.mark.parametrize("interruption", [(), (4,)], ids=["supported", "not in one frame"])
+def test_features_of_a_static_person_fit_in_all_frames(interruption: tuple[int, ...]) -> None:
+    depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
+    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mask[:, :, : CAMERA.width // 2] = True
+    person = Instances(mask, torch.tensor([PERSON]), torch.tensor([0.5]), torch.zeros(1, 4))
+    columns = torch.arange(2, CAMERA.width, 2)
+    pixel = torch.stack([columns, torch.full_like(columns, CAMERA.height // 2)], dim=1)
+    on_person, stage = mask[0, pixel[:, 1], pixel[:, 0]], ObjectStage(ObjectsConfig())
+    for frame in range(10):
+        stage.feature_support = FeatureSupport(pixel, ~on_person if frame in interruption else on_person | ~on_person)
+        (obj,) = stage(frame / 30, person, depth, HERE).objects
+    assert obj.motion_state is (MotionState.UNKNOWN if interruption else MotionState.STATIC)
 
 
 @pytest.mark.parametrize("label", [PERSON, DOG])
@@ -756,6 +779,22 @@ def test_nothing_is_dynamic_without_free_space_evidence() -> None:
         depth, owner = render(things, frame / 30, HERE, 0.0)
         result = stage(frame / 30, detect(owner, things, set()), nothing, HERE, cloud_depth=depth)
         assert [obj.motion_state for obj in result.objects] == [MotionState.STATIC, MotionState.STATIC]
+
+
+@pytest.mark.parametrize(("label", "motion_state"), [(PERSON, MotionState.DYNAMIC), (CHAIR, MotionState.STATIC)])
+def test_furniture_of_which_little_is_known_to_have_appeared_is_static(label: int, motion_state: MotionState) -> None:
+    """The view before did not observe most of the place of the object; what it observed was free."""
+    stage = ObjectStage(load_config(None, (STRIDE,)).objects)
+    wall = torch.full((1, CAMERA.height, CAMERA.width), WALL)
+    wall[..., 60:] = 0.0
+    nobody = Instances.empty(CAMERA.height, CAMERA.width)
+    for frame in range(2):
+        stage(0.3 * frame, nobody, wall, HERE)
+    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mask[:, 30:90, 40:140] = True
+    instance = Instances(mask, torch.tensor([label]), torch.tensor([0.9]), torch.zeros(1, 4))
+    (obj,) = stage(0.6, instance, torch.full_like(wall, WALL).masked_fill(mask, 2.0), HERE).objects
+    assert obj.motion_state is motion_state
 
 
 def test_empty_scene_gives_empty_result() -> None:

@@ -30,7 +30,7 @@ from v3d_torch.objects.motion_evidence import (
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
-from v3d_torch.objects.track import Track
+from v3d_torch.objects.track import STAMP_TOLERANCE, Track
 from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import Instances
 
@@ -41,6 +41,10 @@ hundredths of an object."""
 _MIN_MISSED_SCORE = 0.3
 """A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones
 or one strong one: the network labels rotated furniture as people in single frames."""
+
+_MIN_SUPPORTED_TIME = 0.3
+"""The features on a static object fit the camera motion for at least this long, seconds. Between two frames those on a
+person fit it too, if the person walks slowly or along the line of sight."""
 
 
 class MotionClassifier:
@@ -105,10 +109,9 @@ class MotionClassifier:
 
         # Motion states, with memory over frames.
         supported = feature_support.supports([track.cloud_pixels for track in tracks]).tolist()
-        motion_states = {
-            track: self._motion_state(track, free_space.appeared[track], stamp, is_supported)
-            for track, is_supported in zip(tracks, supported, strict=True)
-        }
+        for track, is_supported in zip(tracks, supported, strict=True):
+            track.mark_supported(stamp, is_supported)
+        motion_states = {track: self._motion_state(track, free_space.appeared[track], stamp) for track in tracks}
         detected_masks = _unions_of_masks(detected, {track.label for track in tracks if track.missed and track.visible})
         objects = [
             TrackedObject(
@@ -173,14 +176,13 @@ class MotionClassifier:
             if track.label in LIVING and not self._is_held_dynamic(track, stamp)
         }
 
-    def _motion_state(self, track: Track, appeared: list[float], stamp: float, supported: bool) -> MotionState:
+    def _motion_state(self, track: Track, appeared: list[float], stamp: float) -> MotionState:
         """Return the motion state of an object.
 
         Args:
             track: Track of the object.
             appeared: Fraction of the object's pixels that appeared, for each time span of the free-space check.
             stamp: Timestamp of the frame, seconds.
-            supported: True if the features on the object fit the camera motion.
         """
         config = self._config.static_mask
         if track.last_dynamic == stamp:
@@ -200,7 +202,8 @@ class MotionClassifier:
             return MotionState.DEFORMING
         # Without a centroid, for example because the object is too far for its depth, its motion is never measured.
         is_new = stamp - track.first_stamp < config.confirm_static_time or not track.newest.has_centroid
-        if track.label in LIVING and is_new and not at_rest_over_all and not supported:
+        is_supported = stamp - track.supported_since >= _MIN_SUPPORTED_TIME - STAMP_TOLERANCE
+        if track.label in LIVING and is_new and not at_rest_over_all and not is_supported:
             return MotionState.UNKNOWN
         return MotionState.STATIC
 

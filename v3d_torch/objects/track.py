@@ -108,6 +108,8 @@ class Track:
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
         last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
+        supported_since: Timestamp of the first frame since which its features have fitted the camera motion in every
+            frame, seconds; infinity if they did not in the newest frame.
         history: States of the visible part after detections of the last 10 s, oldest first.
     """
 
@@ -130,6 +132,7 @@ class Track:
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
+    supported_since: float = torch.inf
 
     def __post_init__(self, config: TrackerConfig) -> None:
         self.history: list[ObjectState] = []
@@ -263,6 +266,7 @@ class Track:
             stamp: Timestamp of the first detection afterwards, seconds.
         """
         self.first_stamp = stamp
+        self.supported_since = torch.inf
         self.detections = []
 
     def update_label(self, label: int, score: float) -> None:
@@ -312,6 +316,10 @@ class Track:
     def mark_deforming(self, stamp: float) -> None:
         """Record that the object deforms in the frame at ``stamp``, seconds."""
         self.last_deforming = stamp
+
+    def mark_supported(self, stamp: float, is_supported: bool) -> None:
+        """Record whether the features on the object fit the camera motion in the frame at ``stamp``, seconds."""
+        self.supported_since = min(self.supported_since, stamp) if is_supported else torch.inf
 
     def apply_world_correction(self, T_new_old: Tensor, since: float = -torch.inf) -> None:
         """Transform the track, or what was measured since some time, into the corrected world.
