@@ -38,8 +38,8 @@ def segment_with_nan(frame: RGBDFrame) -> Instances:
 def test_wrong_focal_lengths_are_found_again(
     factor: float, features: int, sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With half the focal lengths the first run finds no accurate ones, but such with which the second run does."""
-    monkeypatch.setattr("v3d_torch.runs.calibration_run._MAX_RUNS", 2)  # to save time
+    """With half the focal lengths the first runs find none or no accurate ones, but the next one does."""
+    monkeypatch.setattr("v3d_torch.runs.calibration_run._MAX_RUNS", 3)  # to save time
     right = load_sequence(str(sequence)).camera
     (tmp_path / "wrong.yaml").write_text(camera_text(replace(right, fx=factor * right.fx, fy=factor * right.fy)))
     out = tmp_path / "camera.yaml"

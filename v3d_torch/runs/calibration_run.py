@@ -27,6 +27,10 @@ _MAX_RUNS = 4
 _CONVERGED = 0.5
 """Maximum change of an estimate between two runs at convergence, in standard deviations."""
 
+_MIN_PIXEL_SIGMA = 1.0
+"""Minimum standard deviation of the position of a feature in the runs, pixels: a wrong camera adds to the errors, and
+with a smaller one the landmarks that show how it is wrong would be outliers."""
+
 UNITS = {
     **dict.fromkeys(("fx", "fy", "cx", "cy"), "{}, pixels"),
     **dict.fromkeys(("readout", "depth_delay"), "{}, s"),
@@ -49,7 +53,8 @@ def calibrate_sequence(
         sequence: Sequence with the given camera.
         reopen: Function that opens the sequence with another camera.
         make_segmenter: Function that makes the segmenter of a run with this camera.
-        config: Configuration of the runs.
+        config: Configuration of the first run, in which ``tracking.pixel_sigma`` is at least a pixel; the later ones
+            have other seeds.
         on_run: Called before each run with its number, from 1, and the number of frames; returns a function that is
             called after each frame.
 
@@ -62,8 +67,10 @@ def calibrate_sequence(
     given = camera = sequence.camera
     previous: Calibration | None = None
     for number in range(1, _MAX_RUNS + 1):
-        torch.manual_seed(config.seed)
-        pipeline = Pipeline(sequence, make_system(camera, make_segmenter(camera), config), evaluate_masks=False)
+        config_of_run = _config_of_run(config, number)
+        torch.manual_seed(config_of_run.seed)
+        slam = make_system(camera, make_segmenter(camera), config_of_run)
+        pipeline = Pipeline(sequence, slam, evaluate_masks=False)
         record = pipeline(on_run(number, len(sequence)))
         if record.failure is not None:
             raise InputError(record.failure)
@@ -75,13 +82,20 @@ def calibrate_sequence(
             sequence.groundtruth,
             camera,
             given,
-            config,
+            config_of_run,
         )
         if _is_converged(calibration, camera, previous):
             break
         previous, camera = calibration, calibration.next_camera
         sequence = reopen(camera)
     return calibration
+
+
+def _config_of_run(config: Config, number: int) -> Config:
+    """Return the configuration of a run, by its number from 1: with other random samples than in the runs before."""
+    sigma = max(config.tracking.pixel_sigma, _MIN_PIXEL_SIGMA)
+    tracking = config.tracking.model_copy(update={"pixel_sigma": sigma})
+    return config.model_copy(update={"tracking": tracking, "seed": config.seed + number - 1})
 
 
 def _is_converged(calibration: Calibration, camera: PinholeCamera, previous: Calibration | None) -> bool:
@@ -93,8 +107,8 @@ def _is_converged(calibration: Calibration, camera: PinholeCamera, previous: Cal
         previous: Calibration from the run before; None after the first run.
     """
     accepted, before = calibration.accepted, {} if previous is None else previous.accepted
-    if "fx" not in accepted and calibration.next_camera.fx != camera.fx:
-        return False  # other focal lengths explain the images better
+    if "fx" not in accepted and (previous is None or calibration.next_camera.fx != camera.fx):
+        return False  # other focal lengths explain the images better, or other random samples could show them
     return accepted.keys() == before.keys() and all(
         abs(each.value - before[name].value) <= _CONVERGED * each.sigma for name, each in accepted.items()
     )
