@@ -73,10 +73,15 @@ class MaskRefiner:
         return find_concave_edges(self._view.depth[0].numpy()[:: self._stride, :: self._stride])
 
     @cached_property
+    def _known(self) -> NDArray[np.bool_]:
+        """Every n-th pixel whose surface was there before."""
+        return self._newly_occupied.previously_occupied.numpy()
+
+    @cached_property
     def _growable(self) -> NDArray[np.bool_]:
         """Every n-th pixel over which a surface can grow: no edge, and not occupied before the object appeared."""
         smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
-        return smooth & ~(self._concave | self._newly_occupied.previously_occupied.numpy())
+        return smooth & ~(self._concave | self._known)
 
     def refine(self, track: Track) -> Tensor:
         """Return the refined mask of one of the objects, bool, shape :math:`(H, W)`."""
@@ -107,7 +112,7 @@ class MaskRefiner:
         """
         step = self._stride
         left = track.mask.numpy() & ~mask & ~self._view.missing.numpy()
-        cells = left[::step, ::step] & ~self._newly_occupied.previously_occupied.numpy()
+        cells = left[::step, ::step] & ~self._known
         # Contours are coarse: narrow parts along them are background that was not observed before.
         kernel = ellipse(max(_MIN_PART_RADIUS // step, 1))
         parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
