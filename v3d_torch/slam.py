@@ -231,7 +231,7 @@ class V3DSLAM(FramePreprocessor):
             instances = self._complete_instances(segmentation.instances, view, newly_occupied)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
-            is_propagated = instances.track_ids is not None  # by ids, so that appearance is not compared
+            is_propagated = instances.track_ids is not None  # their ids are known without a comparison
             appearance = None if is_propagated else self.describe_appearance(frame.image, clouds.cloud_pixels)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))

@@ -404,13 +404,17 @@ def test_standing_person_is_unknown_before_static(rate: float) -> None:
             assert frame[2].motion_state is MotionState.STATIC
 
 
-@pytest.mark.parametrize(("fitting", "motion_state"), [(1.0, MotionState.STATIC), (0.2, MotionState.UNKNOWN)])
+@pytest.mark.parametrize(
+    ("fitting", "interruption", "motion_state"),
+    [(1.0, None, MotionState.STATIC), (0.2, None, MotionState.UNKNOWN), (1.0, 4, MotionState.UNKNOWN)],
+)
 def test_person_with_supporting_features_is_static_after_a_third_of_a_second(
-    fitting: float, motion_state: MotionState
+    fitting: float, interruption: int | None, motion_state: MotionState
 ) -> None:
     """Rotated furniture over most of the image: the features on it are evidence before the free-space check is.
 
-    A person who walks slowly or towards the camera has features that fit between two frames.
+    A person who walks slowly or towards the camera has features that fit between two frames. The interruption is the
+    index of a frame in which no feature on the person fits.
     """
     depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
     mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
@@ -422,27 +426,12 @@ def test_person_with_supporting_features_is_static_after_a_third_of_a_second(
     on_person = mask[0, pixel[:, 1], pixel[:, 0]]
     fits[on_person] &= torch.rand(int(on_person.sum()), generator=torch.Generator().manual_seed(1)) < fitting
     stage = ObjectStage(ObjectsConfig())
-    stage.feature_support = FeatureSupport(pixel, fits)
     for frame in range(9):
+        stage.feature_support = FeatureSupport(pixel, fits & ~on_person if frame == interruption else fits)
         (obj,) = stage(frame / 30, person, depth, HERE).objects
         assert obj.motion_state is MotionState.UNKNOWN
     (obj,) = stage(9 / 30, person, depth, HERE).objects
     assert obj.motion_state is motion_state
-
-
-@pytest.mark.parametrize("interruption", [(), (4,)], ids=["supported", "not in one frame"])
-def test_features_of_a_static_person_fit_in_all_frames(interruption: tuple[int, ...]) -> None:
-    depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
-    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
-    mask[:, :, : CAMERA.width // 2] = True
-    person = Instances(mask, torch.tensor([PERSON]), torch.tensor([0.5]), torch.zeros(1, 4))
-    columns = torch.arange(2, CAMERA.width, 2)
-    pixel = torch.stack([columns, torch.full_like(columns, CAMERA.height // 2)], dim=1)
-    on_person, stage = mask[0, pixel[:, 1], pixel[:, 0]], ObjectStage(ObjectsConfig())
-    for frame in range(10):
-        stage.feature_support = FeatureSupport(pixel, ~on_person if frame in interruption else on_person | ~on_person)
-        (obj,) = stage(frame / 30, person, depth, HERE).objects
-    assert obj.motion_state is (MotionState.UNKNOWN if interruption else MotionState.STATIC)
 
 
 @pytest.mark.parametrize("label", [PERSON, DOG])

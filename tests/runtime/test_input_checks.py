@@ -68,9 +68,9 @@ def test_gravity_that_is_no_unit_vector_is_rejected(gravity: Any, found: str) ->
 
 
 def test_segmenter_that_assigns_ids_is_rejected() -> None:
-    segment = lambda _: replace(INSTANCES, track_ids=torch.tensor([1, 2]))  # noqa: E731
+    slam = make_slam(lambda _: replace(INSTANCES, track_ids=torch.tensor([1, 2])))
     with pytest.raises(ConfigError, match="the segmenter's track_ids for frame 7 are set; leave them None"):
-        make_slam(segment)(FRAME)
+        slam(FRAME)
 
 
 def test_valid_frames_are_tracked_with_and_without_a_camera() -> None:

@@ -44,7 +44,7 @@ def detect_corners(
     Weak corners lie on surfaces with little contrast. A corner is a local maximum of the strength: the least
     difference of brightness between a pixel and an arc of nine pixels around it, for the best arc. Of equal neighbours,
     the first is the maximum. Between pixels, the maximum is that of the parabola through the strength of three adjacent
-    pixels, along rows and along columns: it halves the error of the position.
+    pixels, along rows and along columns: it halves the median error.
 
     Args:
         image: Grey image, uint8, shape :math:`(H, W)`, or several images below each other.

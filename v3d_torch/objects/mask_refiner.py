@@ -111,12 +111,12 @@ class MaskRefiner:
         A network sometimes draws one mask over two people; the second one is not known background.
         """
         step = self._stride
-        left = track.mask.numpy() & ~mask & ~self._view.missing.numpy()
-        cells = left[::step, ::step] & ~self._known
+        beyond = track.mask.numpy() & ~mask & ~self._view.missing.numpy()
+        cells = beyond[::step, ::step] & ~self._known
         # Contours are coarse: narrow parts along them are background that was not observed before.
         kernel = ellipse(max(_MIN_PART_RADIUS // step, 1))
         parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
-        return left & upsample_nearest(parts, step, left.shape).numpy()
+        return beyond & upsample_nearest(parts, step, beyond.shape).numpy()
 
     def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
         """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (H, W)."""
