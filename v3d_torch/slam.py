@@ -218,9 +218,9 @@ class V3DSLAM(FramePreprocessor):
         self.timer.add(preprocessed.times)
         with self.timer("odometry"):  # III-E: camera motion since the previous frame, from its static pixels
             prediction = self.motion_model.predict(self.poses)
-            features = self._compensate(preprocessed.extraction.features, preprocessed, prediction.velocity)
-            T_cp, current = prediction.motion_until(frame.stamp), TrackedFrame(frame, depth, features)
-            motion = self.odometry(self._previous, current, T_cp, prediction.velocity)
+            T_cp, velocity = prediction.motion_until(frame.stamp), prediction.velocity_at(frame.stamp)
+            features = self._compensate(preprocessed.extraction.features, preprocessed, velocity)
+            motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
             T_cw, was_lost = self._compose_pose(motion), self.poses.status is TrackingStatus.LOST
@@ -241,8 +241,8 @@ class V3DSLAM(FramePreprocessor):
             is_static = features.in_mask(objects.static_mask)
             static = self._compensate(preprocessed.extraction.features[is_static], preprocessed, motion.velocity)
             landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
-            velocity = self.motion_model.previous_velocity(self.poses, motion)
-            self.refine_previous(self._previous, velocity, self.poses, self.compensate)
+            previous_velocity = self.motion_model.previous_velocity(self.poses, motion)
+            self.refine_previous(self._previous, previous_velocity, self.poses, self.compensate)
             pose = self.track_camera(static, depth, self._compose_pose(motion), landmarks, motion, self.poses)
             owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             self.motion_model.update(self.poses, frame.stamp, pose, motion)

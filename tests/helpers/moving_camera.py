@@ -57,7 +57,7 @@ class Camera:
         """Append a frame; ``T_cp`` is the measured motion since the previous one, None if it is not measured."""
         predicted, pairs = self.model.predict(self.poses), torch.zeros(0, 2, dtype=torch.int64)
         if T_cp is None:
-            motion = CameraMotion(predicted.motion_until(stamp), predicted.velocity, pairs, is_measured=False)
+            motion = CameraMotion(predicted.motion_until(stamp), predicted.velocity_at(stamp), pairs, is_measured=False)
         else:
             motion = CameraMotion(T_cp, se3_log(T_cp) / (stamp - self.poses.stamp), pairs, is_measured=True)
         self.previous_velocity = self.model.previous_velocity(self.poses, motion)

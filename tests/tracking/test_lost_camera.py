@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -12,6 +13,8 @@ import torch
 from helpers.walls import CAMERA, Slide
 
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets import load_sequence
+from v3d_torch.evaluation.ate import absolute_errors, align
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import TrackingStatus
@@ -75,6 +78,19 @@ def test_part_without_a_loop_stays_disconnected_when_a_loop_joins_a_later_part()
     assert slam.loop_closer.loop_count == 1
     parts = [keyframe.part for keyframe in slam.map.keyframes]
     assert [part for part, _ in groupby(parts)] == [0, 1, 0, 1]
+
+
+def test_camera_that_turns_fast_after_a_gap_is_tracked_as_accurately_as_without(
+    real_sequence: Callable[[str], Path],
+) -> None:
+    """In the first frame after the gap the velocity is unknown, and so is the distortion of the rolling shutter."""
+    sequence = load_sequence(str(real_sequence("fr1_rpy")))
+    before, gap, after = 60, 150, 12
+    case = interruptions.dropped(len(sequence), before, gap, after)
+    result = lost.run_case(sequence, case, CONFIG, None)
+    truth = lost.true_poses(sequence)[case.shown]
+    errors = absolute_errors(truth, result.T_wc, align(truth, result.T_wc))
+    assert errors[before:].max() < 0.02  # 0.05 if landmarks were left where the first frame after the gap put them
 
 
 class TestCases:

@@ -49,6 +49,19 @@ def test_prediction_extrapolates_at_most_a_fifth_of_a_second() -> None:
     torch.testing.assert_close(camera.predict(5.0), se3_exp(TWIST * 0.3), rtol=0, atol=1e-9)
 
 
+def test_velocity_is_expected_for_a_fifth_of_a_second() -> None:
+    camera = walk([0.0, 0.1])
+    prediction = camera.model.predict(camera.poses)
+    torch.testing.assert_close(prediction.velocity_at(0.25), TWIST)
+    assert torch.equal(prediction.velocity_at(0.31), torch.zeros_like(TWIST))
+
+
+def test_velocity_of_a_camera_that_is_found_after_a_gap_is_unknown() -> None:
+    camera = walk([0.0, 0.1])
+    camera.append(5.0, replace(frame_pose(EYE), is_relocalised=True), None)
+    assert torch.equal(camera.model.velocity, torch.zeros_like(TWIST))
+
+
 def test_prediction_of_a_lost_camera_continues_shortly_and_then_stands_still() -> None:
     stamps = [k / 30 for k in range(40)]
     camera = walk(stamps[:10])

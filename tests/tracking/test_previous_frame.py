@@ -138,6 +138,35 @@ def test_features_of_the_newest_keyframe_are_compensated_again_in_the_map() -> N
     assert torch.equal(keyframe.T_cw, T_cw) and torch.equal(scene.poses.T_cw, T_cw)  # left to the bundle adjustment
 
 
+def test_keyframe_without_a_measured_motion_is_refined_with_the_landmarks_that_it_creates() -> None:
+    """The first frame after a gap is tracked without a velocity, and the next frames with its landmarks."""
+    scene, known = Scene(), 150
+    T_cw, before = scene.poses.T_cw, scene.pose_error()
+    matched = torch.where(torch.arange(len(scene.ids)) < known, scene.ids, -1)
+    keyframe = scene.map.insert_keyframe(1, 0.1, T_cw, scene.previous.features, matched)
+    motion = CameraMotion(EYE, torch.zeros_like(VELOCITY), NO_PAIRS, is_measured=False)
+    scene.poses.append(0.1, FramePose(TrackingStatus.TRACKED, T_cw, scene.ids[:known]), motion, keyframe, keyframe)
+    old = scene.map.landmarks["point"][scene.ids].clone()
+    created = (keyframe.landmarks >= 0) & (matched < 0)
+    wrong = scene.map.landmarks["point"][keyframe.landmarks[created]] - old[created]
+    scene.refine(scene.previous)
+    error = scene.map.landmarks["point"][keyframe.landmarks[created]] - old[created]
+    assert created.sum() > 50
+    assert scene.pose_error() < 0.1 * before
+    assert error.norm(dim=1).median() < 0.1 * wrong.norm(dim=1).median()
+    assert torch.equal(scene.map.landmarks["point"][scene.ids], old)  # they were created by the first keyframe
+
+
+def test_keyframe_without_a_measured_motion_keeps_its_pose_without_refinement_of_poses() -> None:
+    scene = Scene()
+    T_cw = scene.poses.T_cw
+    keyframe = scene.map.insert_keyframe(1, 0.1, T_cw, scene.previous.features, scene.ids)
+    motion = CameraMotion(EYE, torch.zeros_like(VELOCITY), NO_PAIRS, is_measured=False)
+    scene.poses.append(0.1, FramePose(TrackingStatus.TRACKED, T_cw, scene.ids), motion, keyframe, keyframe)
+    scene.refine(scene.previous, refine_pose=False)
+    assert torch.equal(keyframe.T_cw, T_cw)
+
+
 def test_depth_of_the_newest_keyframe_is_compensated_again_by_its_delay() -> None:
     scene, delay = Scene(), 0.02
     keyframe = scene.map.insert_keyframe(1, 0.1, scene.poses.T_cw, scene.previous.features, scene.ids)

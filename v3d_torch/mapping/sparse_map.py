@@ -150,25 +150,30 @@ class SparseMap(MapTables):
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
-    def update_features(self, keyframe: Keyframe, features: Features) -> None:
+    def update_features(self, keyframe: Keyframe, features: Features, T_cw: Tensor | None = None) -> None:
         """Replace the features of a keyframe by the same features with corrected pixels and depth.
 
-        If the keyframe created all landmarks that it observes, its pose does not depend on its features, as that of the
-        first keyframe. Landmarks that no other keyframe observes then move with their feature. In other keyframes they
-        wait for the bundle adjustment, which also corrects the pose.
+        Landmarks that no other keyframe observes move with their feature if the pose is correct: it was refined with
+        these features, or does not depend on features, because the keyframe created all landmarks that it observes, as
+        the first one. In other keyframes they wait for the bundle adjustment, which also corrects the pose.
 
         Args:
             keyframe: Keyframe of this map.
             features: The corrected features, in the same order.
+            T_cw: World-to-camera pose, refined with these features, float64, shape :math:`(4, 4)`; None to keep the
+                pose.
         """
         keyframe.features = features
         rows = torch.nonzero(self.observations["keyframe"] == keyframe.index)[:, 0]
         feature, landmark = (self.observations[name][rows] for name in ("feature", "landmark"))
         for name in ("uv", "inverse_depth", "readout_jacobian"):
             self.observations[name][rows] = getattr(features, name)[feature]
-        if not bool((self.landmarks["keyframe"][landmark] == keyframe.index).all()):
+        created = self.landmarks["keyframe"][landmark] == keyframe.index
+        if T_cw is not None:
+            keyframe.T_cw = T_cw
+        elif not bool(created.all()):
             return
-        is_own = torch.bincount(self.observations["landmark"])[landmark] == 1
+        is_own = created & (torch.bincount(self.observations["landmark"])[landmark] == 1)
         moved = is_own & self.landmarks["active"][landmark] & (features.depth[feature] > 0)
         points = landmark_points(invert(keyframe.T_cw), features[feature[moved]], self.camera)
         self.landmarks["point"][landmark[moved]] = points

@@ -38,6 +38,10 @@ class PosePrediction:
         """Motion ``T_cp`` from the camera at the frame to the camera at ``stamp``, float64, shape :math:`(4, 4)`."""
         return se3_exp(self.velocity * min(stamp - self.stamp, MAX_EXTRAPOLATION))
 
+    def velocity_at(self, stamp: float) -> Tensor:
+        """Velocity expected at ``stamp``, float64, shape :math:`(6,)`; zero if it is too late to extrapolate."""
+        return self.velocity * (stamp - self.stamp < MAX_EXTRAPOLATION)
+
     def pose_at(self, stamp: float) -> Tensor:
         """World-to-camera pose at ``stamp``, float64, shape :math:`(4, 4)`."""
         return self.motion_until(stamp) @ self.T_cw
@@ -84,11 +88,10 @@ class MotionModel:
         if not len(poses):
             return
         elapsed = stamp - poses.stamp
-        if motion.is_measured and (pose.status is TrackingStatus.LOST or pose.is_relocalised):
-            self.velocity = motion.velocity
-        elif pose.status is TrackingStatus.LOST:
-            self.velocity = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
-        elif poses.status is not TrackingStatus.LOST and not pose.is_relocalised and elapsed > 0:
+        if pose.status is TrackingStatus.LOST or pose.is_relocalised:
+            last = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
+            self.velocity = motion.velocity if motion.is_measured else last
+        elif poses.status is not TrackingStatus.LOST and elapsed > 0:
             self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / max(elapsed, MIN_INTERVAL)
 
     def state_dict(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from v3d_torch.features.features import Features
+from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.odometry import TrackedFrame
 from v3d_torch.tracking.map_tracker import MapTracker
@@ -17,7 +18,9 @@ class PreviousFrameRefinement:
     """Compensates the features of the previous frame again with a better velocity, and refines its pose.
 
     If the previous frame is the newest keyframe, its features in the map are updated, and bundle adjustment refines its
-    pose.
+    pose. If the motion to the keyframe was not measured, as in the first frame after a gap, it was tracked without a
+    velocity. Its pose is then refined here, and its new landmarks move with it, before other frames are tracked with
+    them.
 
     Args:
         track_map: Refines a pose.
@@ -51,10 +54,23 @@ class PreviousFrameRefinement:
         keyframe, depth, delay = self._map.keyframe_at(previous.frame.stamp), previous.depth, previous.frame.depth_delay
         if keyframe is not None:
             features = compensate(keyframe.features, depth, delay, velocity, self._map.readout)
-            self._map.update_features(keyframe, features)
+            had_velocity = poses.is_motion_measured or not self._refine_pose
+            self._map.update_features(keyframe, features, None if had_velocity else self._refine(keyframe, features))
         elif self._refine_pose:
             matched, points = self._map.landmark_positions(previous.landmarks)
             features = compensate(previous.features[matched], depth, delay, velocity, self._map.readout)
             refined = self._track_map.refine(poses.T_cw, points, features, rounds=1)
             if refined is not None:
                 poses.replace_last(refined.T_cw)
+
+    def _refine(self, keyframe: Keyframe, features: Features) -> Tensor | None:
+        """Refine the pose of a keyframe with the landmarks of earlier keyframes; None if it observes too few of them.
+
+        Args:
+            keyframe: Newest keyframe.
+            features: Its features, compensated again.
+        """
+        created = self._map.landmarks["keyframe"][keyframe.landmarks] == keyframe.index
+        matched, points = self._map.landmark_positions(keyframe.landmarks.masked_fill(created, -1))
+        refined = self._track_map.refine(keyframe.T_cw, points, features[matched], rounds=4)
+        return None if refined is None else refined.T_cw
