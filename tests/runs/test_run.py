@@ -142,6 +142,22 @@ class PartlyFar(StoredWall):
         return replace(frame, depth=20 * frame.depth)
 
 
+class FarBehindNear(StoredWall):
+    """The wall far beyond the maximum depth, behind something near that covers a third of the image."""
+
+    def __getitem__(self, index: int) -> RGBDFrame:
+        frame = super().__getitem__(index)
+        depth = 20 * frame.depth
+        depth[..., :107] = frame.depth[..., :107]
+        return replace(frame, depth=depth)
+
+
+def left_third(frame: RGBDFrame) -> Instances:
+    mask = torch.zeros(1, *frame.depth.shape[1:], dtype=torch.bool)
+    mask[..., :107] = True
+    return Instances.from_masks(mask, torch.tensor([PERSON]))
+
+
 class Strip(StoredWall):
     """A strip of the wall, 60 rows high."""
 
@@ -209,6 +225,13 @@ def test_objects_are_the_cause_only_if_they_are_in_most_of_the_lost_frames(
     run = Run(RunRequest("wall", Config()), Unrelated(), segment, tmp_path)
     run(lambda *_: None)
     assert any(f" of {FRAMES} frames are lost: {cause}" in each for each in run.pipeline.record.warnings)
+
+
+def test_depth_that_is_too_far_is_the_cause_also_behind_a_person(tmp_path: Path) -> None:
+    run = Run(RunRequest("wall", Config()), FarBehindNear(), left_third, tmp_path)
+    run(lambda *_: None)
+    cause = f"frames are lost: most depth is beyond {Config().features.max_depth:g} m; correct the camera's depth_scale"
+    assert any(cause in each for each in run.pipeline.record.warnings)
 
 
 def test_loss_of_few_frames_has_no_warning(tmp_path: Path) -> None:

@@ -24,6 +24,10 @@ _MAX_PLAIN_SIGMA = 4.0
 _MAX_EMPTY_FRACTION = 0.01
 """Maximum fraction of pixels with depth in a depth image without content."""
 
+_MAX_NEAR_FRACTION = 0.5
+"""Maximum fraction of the depth of an image within `features.max_depth`, if the rest is the cause of the loss: people
+can be near although the room is too far."""
+
 _MIN_IMAGE_SIZE = 96
 """Minimum number of rows and of columns of an image in which enough features are found in most scenes."""
 
@@ -88,12 +92,12 @@ def _cause_of_loss(pipeline: Pipeline, indices: Tensor) -> str:
                 f"at most {100 * max(fractions):.2g}% of the pixels have depth; record again within the range of the"
                 " depth camera, or export the depth again"
             )
-        if all(
-            float(((frame.depth > 0) & (frame.depth < max_depth)).float().mean()) < _MAX_EMPTY_FRACTION
-            for frame in frames
-        ):
+        measured = [frame.depth[frame.depth > 0] for frame in frames]
+        near = max(float((depth < max_depth).float().mean()) for depth in measured if len(depth))
+        if near < _MAX_NEAR_FRACTION:
+            amount = "nearly all" if near < _MAX_EMPTY_FRACTION else "most"
             return (
-                f"nearly all depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise"
+                f"{amount} depth is beyond {max_depth:g} m; correct the camera's depth_scale, or raise"
                 " features.max_depth"
             )
     if min(sequence.camera.width, sequence.camera.height) < _MIN_IMAGE_SIZE:
