@@ -23,6 +23,8 @@ from v3d_torch.datasets.base import RGBDSequence
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.diagnosis import check_lost_frames, diagnose
+from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation import make_instance_source, wrap_upright
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, Segmenter, Trajectory
@@ -160,7 +162,7 @@ def _position(frame: RGBDFrame) -> Tensor:
 
 
 def find_warnings(sequence: RGBDSequence, segment: Segmenter, config: Config) -> list[str]:
-    """Run a sequence and return its warnings.
+    """Run a sequence and return what the command would say: warnings, and the cause of lost frames.
 
     Raises:
         V3DError: If the sequence is refused.
@@ -171,7 +173,8 @@ def find_warnings(sequence: RGBDSequence, segment: Segmenter, config: Config) ->
     if record.failure is not None:
         raise V3DError(record.failure)
     pipeline.flush()
-    return record.warnings
+    diagnosis = diagnose(pipeline, RunRequest(sequence.name, config), None)
+    return [*record.warnings, *check_lost_frames(pipeline), *([] if diagnosis is None else [diagnosis])]
 
 
 def measure(source: str, frames: int, config: Config) -> Iterator[Row]:
