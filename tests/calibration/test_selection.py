@@ -40,6 +40,8 @@ def select(given: PinholeCamera, **settings: float) -> dict[str, Estimate]:
         (5.0, math.inf, False, NOT_DETERMINED),
         (math.nan, math.nan, False, NOT_DETERMINED),
         (2.0, 1.0, False, AGREES),
+        (4.1, 1.0, False, AGREES),  # the standard deviation is accurate to a quarter of itself
+        (4.4, 1.0, True, ""),
     ],
 )
 def test_estimate_is_accepted_if_it_is_accurate_and_differs(

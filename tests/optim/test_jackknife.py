@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
+import scipy.stats
 import torch
 from torch import Tensor
 
-from v3d_torch.optim.jackknife import jackknife_covariance
+from v3d_torch.optim.jackknife import jackknife_covariance, p_value
 
 
 def make_groups(groups: int, seed: int, common: float = 0.0, size: int = 20) -> tuple[Tensor, Tensor]:
@@ -86,3 +89,38 @@ def test_groups_with_information_on_some_parameters_count() -> None:
     hessian = hessian * torch.eye(2)
     gradient[1::2, 1], hessian[1::2, 1, 1] = 0.0, 0.0
     torch.testing.assert_close(jackknife_covariance(gradient, hessian), leave_one_of_eight_out(gradient, hessian))
+
+
+def one(value: float) -> Tensor:
+    return torch.tensor([[value]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("difference", [0.0, 0.5, 3.3, -8.0])
+def test_p_value_of_one_parameter_is_that_of_a_t_test(difference: float) -> None:
+    # The covariance of the jackknife includes the variance of the t-distribution.
+    expected = 2 * scipy.stats.t.sf(abs(difference) / 2.0, 9)
+    assert p_value(one(difference)[0], one(4.0 * 9 / 7), one(0.0)) == pytest.approx(expected, rel=1e-9)
+
+
+def test_p_value_of_known_errors_is_that_of_a_chi_squared_test() -> None:
+    known, difference = torch.diag(torch.tensor([1.0, 4.0])).double(), torch.tensor([2.0, -5.0]).double()
+    expected = scipy.stats.chi2.sf(4.0 + 25.0 / 4.0, 2)
+    assert p_value(difference, torch.zeros_like(known), known) == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("known", [0.0, 0.02, 0.2])
+def test_p_values_of_true_parameters_are_uniform(known: float) -> None:
+    """A chi-squared test calls twice as many significant at 0.01, and ten times as many at 0.001, if nothing is known."""
+    true, generator = torch.tensor([0.5, -2.0], dtype=torch.float64), torch.Generator().manual_seed(0)
+    values = []
+    for seed in range(600):
+        gradient, hessian = make_groups(10, seed, common=2.0)
+        other = known**0.5 * torch.randn(2, generator=generator, dtype=torch.float64)
+        error = minimum(gradient, hessian) - true + other
+        values.append(p_value(error, jackknife_covariance(gradient, hessian), known * torch.eye(2).double()))
+    for level in (0.01, 0.05, 0.5):
+        assert sum(value < level for value in values) / len(values) == pytest.approx(level, abs=0.3 * level + 0.01)
+
+
+def test_p_value_of_an_unknown_difference_is_not_a_number() -> None:
+    assert math.isnan(p_value(one(torch.nan)[0], one(1.0), one(0.0)))

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import scipy
 import torch
 from torch import Tensor
 
@@ -24,7 +23,7 @@ from v3d_torch.calibration.parameters import (
 )
 from v3d_torch.calibration.problem import AdjustedMap, SelfCalibration
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.optim.jackknife import MAX_BLOCKS, jackknife_covariance
+from v3d_torch.optim.jackknife import MAX_BLOCKS, jackknife_covariance, p_value
 
 MAX_P_VALUE = 1e-3
 """Significance level: maximum probability of a difference by chance with which an estimate is accepted."""
@@ -81,7 +80,8 @@ def decide(name: str, given: float, value: float, sigma: float, tolerance: float
     """
     if not sigma <= tolerance:
         return Estimate(name, given, value, sigma, accepted=False, reason=NOT_DETERMINED)
-    if scipy.special.chdtrc(1, ((value - given) / sigma) ** 2) > MAX_P_VALUE:
+    difference, variance = torch.tensor([value - given]).double(), torch.tensor([[sigma**2]]).double()
+    if p_value(difference, variance, torch.zeros_like(variance)) > MAX_P_VALUE:
         return Estimate(name, given, value, sigma, accepted=False, reason=AGREES)
     return Estimate(name, given, value, sigma, accepted=True, reason="")
 
@@ -201,13 +201,11 @@ class ParameterSelection:
         return least if p_values[least] > MAX_P_VALUE else None
 
     def _p_value(self, group: ParameterGroup) -> float:
-        """Probability that a difference from the given values as large as this one occurs by chance (Wald test)."""
+        """Probability that a difference from the given values as large as this one occurs by chance."""
         names = list(group.parameters)
         difference = torch.tensor([self.fit.values[name] for name in names]) - self._problem.given_values(names)
         model_error = torch.tensor([self.fit.model_error(name) for name in names], dtype=torch.float64)
-        total = self.fit.covariance_of(group) + model_error.square().diag()
-        statistic = difference @ torch.linalg.solve(total, difference)
-        return float(scipy.special.chdtrc(len(names), max(float(statistic), 0.0)))
+        return p_value(difference, self.fit.covariance_of(group), model_error.square().diag())
 
     def _reject(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
         for name in group.parameters:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import scipy
 import torch
 from torch import Tensor
 
 MAX_BLOCKS = 10
 """Maximum number of blocks. With ten blocks, the standard deviation is accurate to a quarter of itself, and the blocks
 are long enough for their errors to be nearly uncorrelated."""
+
+_FREEDOM = MAX_BLOCKS - 1
+"""Degrees of freedom of a covariance from so many blocks."""
 
 MIN_BLOCKS = 4
 """Minimum number of blocks: with fewer, the variance of the t-distribution is not finite."""
@@ -43,6 +47,34 @@ def jackknife_covariance(gradient: Tensor, hessian: Tensor, max_blocks: int = MA
     step = torch.linalg.solve(total, -gradient.sum(dim=0))
     change = torch.linalg.solve(rest, gradient + hessian @ step)
     return (blocks - 1) / blocks * (blocks - 1) / (blocks - 3) * (change.T @ change)
+
+
+def p_value(difference: Tensor, covariance: Tensor, known: Tensor) -> float:
+    r"""Probability that a difference between an estimate and the truth as large as this one occurs by chance.
+
+    A covariance from few blocks is itself uncertain, so that the quadratic form of the difference has the distribution
+    of Hotelling's :math:`T^2` (Annals of Mathematical Statistics 1931) and not a chi-squared distribution. If a part of
+    the covariance is known, the degrees of freedom are those of Welch (Biometrika 1947) and Satterthwaite (Biometrics
+    Bulletin 1946) along the difference.
+
+    Args:
+        difference: Estimate minus truth, float64, shape :math:`(C,)`.
+        covariance: Covariance of the estimate by `jackknife_covariance`, from `MAX_BLOCKS` blocks, float64, shape
+            :math:`(C, C)`.
+        known: Covariance of other, independent errors, float64, shape :math:`(C, C)`.
+
+    Returns:
+        From 0 to 1; NaN if the difference or the covariance is not finite.
+    """
+    count, uncertain = len(difference), covariance * ((_FREEDOM - 2) / _FREEDOM)
+    weighted = torch.linalg.solve(uncertain + known, difference)
+    squared = max(float(difference @ weighted), 0.0)
+    if squared == 0:
+        return 1.0
+    share = float(weighted @ uncertain @ weighted) / squared
+    freedom = _FREEDOM / max(share, 1e-6) ** 2
+    rest = freedom - count + 1
+    return float(scipy.special.fdtrc(count, rest, squared * rest / (freedom * count)))
 
 
 def _sum_blocks(values: Tensor, max_blocks: int) -> Tensor:
