@@ -13,7 +13,6 @@ from v3d_torch.objects.association import (
     class_log_ratio,
     overlap_log_ratio,
     position_log_ratio,
-    score_log_ratio,
     vacancy_log_ratio,
 )
 
@@ -68,11 +67,6 @@ def test_appearance_says_less_after_some_time_and_about_a_small_part() -> None:
         for view in ((0.1, 400.0, 400.0), (1.0, 400.0, 400.0), (0.1, 400.0, 900.0), (0.1, 80.0, 80.0))
     )
     assert bool((later < soon).all() and (partial < soon).all() and (small < soon).all())
-
-
-def test_weak_detection_speaks_more_against_a_return() -> None:
-    ratio = score_log_ratio(torch.tensor([0.3, 0.9]))
-    torch.testing.assert_close(ratio, torch.tensor([0.45, 0.8], dtype=torch.float64).log())
 
 
 def test_another_class_and_an_empty_place_speak_against_a_track() -> None:

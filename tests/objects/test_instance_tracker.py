@@ -132,6 +132,15 @@ def test_id_is_kept_over_a_gap_in_time_before_a_frame_in_which_the_object_is_mis
     assert [track.id for track in tracks] == [1]
 
 
+def test_id_is_kept_after_a_second_in_which_the_place_of_the_object_was_empty() -> None:
+    """The object has walked out of view and comes back beside its last place."""
+    track_boards, colours = BoardTracker(), torch.eye(HISTOGRAM_SIZE)[:1]
+    for frame in range(37):
+        depth, instances = render([Board(-0.4)] if frame < 6 else [Board(-0.2)] if frame == 36 else [])
+        tracks = track_boards.track(depth, instances, frame / 30, appearance=colours[: len(instances)])
+    assert [track.id for track in tracks] == [1]
+
+
 def test_class_decides_between_two_equally_distant_instances() -> None:
     """Between two frames a dog and a chair moved by half of their distance."""
     track_boards = BoardTracker(5.0)
@@ -363,7 +372,7 @@ def test_walker_detected_again_in_time_keeps_its_id() -> None:
 
 
 def test_object_detected_again_too_late_gets_a_new_id() -> None:
-    track_boards = BoardTracker(10.0)
+    track_boards = BoardTracker(10.0, max_lost_time=0.0)
     previous_ids = set()
     for life in range(1, 5):
         for _ in range(2):

@@ -55,28 +55,25 @@ def test_lost_track_beyond_the_gate_is_impossible() -> None:
 @pytest.mark.parametrize(("colour", "likely"), [(0, True), (1, False)])
 def test_track_lost_for_seconds_is_found_again_by_its_colours(colour: int, likely: bool) -> None:
     (track,) = BoardTracker()(Board(0.0))
-    track.appearance = torch.eye(HISTOGRAM_SIZE)[0]
+    track.update_appearance(torch.eye(HISTOGRAM_SIZE)[0])
     depth, instances = render([Board(0.1)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
     detected = detect_instances(4.0, instances, clouds, torch.eye(HISTOGRAM_SIZE)[colour][None], HERE, 1)
     assert bool(compare_without_masks([track], detected, TrackerConfig()) > 0) is likely
 
 
-def test_weak_detection_is_less_likely_the_return_of_a_lost_track() -> None:
-    (track,) = BoardTracker()(Board(0.0))
-    depth, instances = render([Board(0.1)])
-    clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-    weak, strong = (
-        float(
-            compare_without_masks(
-                [track],
-                detect_instances(1.0, replace(instances, scores=torch.tensor([score])), clouds, None, HERE, 1),
-                TrackerConfig(),
-            )
-        )
-        for score in (0.3, 0.9)
-    )
-    assert weak < strong
+def test_colours_of_a_lost_track_are_those_of_all_its_views_not_of_the_last_small_one() -> None:
+    """The board leaves the image, so that its last view is narrow."""
+    ratios, colours = [], torch.eye(HISTOGRAM_SIZE)[:1]
+    for last in (Board(0.0), Board(0.0, width=0.05)):
+        track_boards = BoardTracker()
+        for frame, board in enumerate([*[Board(0.0)] * 9, last]):
+            (track,) = track_boards.track(*render([board]), frame / 30, appearance=colours)
+        depth, instances = render([Board(0.1)])
+        clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
+        detected = detect_instances(4.0, instances, clouds, colours, HERE, 1)
+        ratios.append(float(compare_without_masks([track], detected, TrackerConfig())))
+    assert ratios[1] > ratios[0] - 0.5
 
 
 def test_empty_place_is_no_evidence_against_the_return_of_a_lost_track() -> None:

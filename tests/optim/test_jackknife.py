@@ -110,7 +110,7 @@ def test_p_value_of_known_errors_is_that_of_a_chi_squared_test() -> None:
 
 @pytest.mark.parametrize("known", [0.0, 0.02, 0.2])
 def test_p_values_of_true_parameters_are_uniform(known: float) -> None:
-    """A chi-squared test calls twice as many significant at 0.01, and ten times as many at 0.001, if nothing is known."""
+    """If nothing is known, a chi-squared test calls ten times as many significant at a level of 0.001."""
     true, generator = torch.tensor([0.5, -2.0], dtype=torch.float64), torch.Generator().manual_seed(0)
     values = []
     for seed in range(600):

@@ -1,8 +1,8 @@
 """Association evidence: likelihood of an instance if it continues a track, relative to that of a new object.
 
 Each kind of evidence is a log-likelihood ratio, as in multiple hypothesis tracking (Blackman, 2004): position, overlap
-of the masks, appearance, class, score and vacancy. Their sum for a pair is positive if the instance more likely
-continues the track than is a new object.
+of the masks, appearance, class and vacancy. Their sum for a pair is positive if the instance more likely continues the
+track than is a new object.
 """
 
 from __future__ import annotations
@@ -51,10 +51,6 @@ _MIN_APPEARANCE = -3.0
 
 _CLASS_CHANGE = -2.0
 """Evidence of a different class; it is small, because the class of an object can change between frames."""
-
-_WEAK_SCORE, _TRUE_FRACTIONS = 0.5, (0.45, 0.8)
-"""Score below which a detection is weak, and fraction of the weak and of the other detections that show a person, of
-those that continue no tracked object."""
 
 _VACANCY_RATE, _MAX_VACANCY = 30.0, 6.0
 """Evidence against a track per second for which its predicted place was observed to be empty, and its upper bound."""
@@ -131,16 +127,6 @@ def class_log_ratio(same_class: Tensor) -> Tensor:
         same_class: Mask of the pairs of the same class, bool, shape :math:`(*)`.
     """
     return torch.where(same_class, 0.0, _CLASS_CHANGE).to(torch.float64)
-
-
-def score_log_ratio(score: Tensor) -> Tensor:
-    """Log-likelihood ratio of scores: weak detections that continue no tracked object are often false.
-
-    Args:
-        score: Score of each instance, shape :math:`(N,)`.
-    """
-    weak, strong = _TRUE_FRACTIONS
-    return torch.where(score < _WEAK_SCORE, math.log(weak), math.log(strong)).to(torch.float64)
 
 
 def vacancy_log_ratio(seconds: float, variance: float) -> float:

@@ -46,7 +46,7 @@ _MAX_VISIBLE_TIME = 0.1
 that the predicted mask is wrong. Tracking leaves out the pixels of all predicted masks nevertheless."""
 
 _MAX_VACANT_TIME = 0.5
-"""A missed object whose place was observed to be empty for longer has gone, seconds."""
+"""A missed object whose place was observed to be empty for longer has gone elsewhere and is lost, seconds."""
 
 _MAX_OBSERVED_TIME = 0.2
 """Time before a frame for which the frame shows what was there, seconds: what happened in a longer gap is unknown."""
@@ -70,7 +70,7 @@ class InstanceTracker(torch.nn.Module):
     Attributes:
         tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
         resting: Tracks that cannot move by themselves and were missed for at most the maximum time.
-        lost: Confirmed tracks that were missed for longer.
+        lost: Confirmed tracks that were missed for longer, or whose place another object or nothing occupies.
         comparable_since: Time of the first detection that can be compared with the newest ones, seconds: before it, a
             motion of the camera was not measured.
     """
@@ -282,7 +282,7 @@ class InstanceTracker(torch.nn.Module):
     def _predict_missed_tracks(
         self, stamp: float, depth: Tensor, predicted: PredictedTracks, updated: Sequence[Track]
     ) -> list[Track]:
-        """Predict the masks of the missed tracks that may move and have neither gone nor are lost; return these."""
+        """Predict the masks of the missed tracks that may move and are not lost; return these."""
         missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
         covered = self._covered(predicted.tracks, predicted.masks & pack_masks(has_depth, self._stride), updated)
@@ -296,9 +296,8 @@ class InstanceTracker(torch.nn.Module):
             seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
                 track.add_vacancy(stamp, min(stamp - self._last_stamp, _MAX_OBSERVED_TIME))
-            if track.vacant_time > _MAX_VACANT_TIME:
-                continue
-            if stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:
+            has_gone = track.vacant_time > _MAX_VACANT_TIME
+            if has_gone or stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:
                 lost.append(track)
                 continue
             mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)

@@ -103,6 +103,7 @@ class Track:
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
         total_score: Sum of the scores of all detections.
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
+        appearance_points: Mean number of points of the views in this histogram, with the same weights.
         vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
         vacancy: Evidence of this, see `vacancy_log_ratio`.
         dynamic_frames: Number of frames in which the vote classified the object as dynamic.
@@ -127,6 +128,7 @@ class Track:
     label: int = UNLABELLED
     total_score: float = 0.0
     appearance: Tensor | None = None
+    appearance_points: float = 0.0
     vacant_time: float = 0.0
     vacancy: float = 0.0
     dynamic_frames: int = 0
@@ -290,11 +292,15 @@ class Track:
         """Update the mean colour histogram.
 
         Args:
-            histogram: Colour histogram of a detection, float32, shape :math:`(D,)`. NaN is ignored.
+            histogram: Colour histogram of the newest detection, float32, shape :math:`(D,)`. NaN is ignored.
         """
         if bool(histogram[0].isnan()):
             return
-        self.appearance = histogram if self.appearance is None else self.appearance.lerp(histogram, _APPEARANCE_RATE)
+        if self.appearance is None:
+            self.appearance, self.appearance_points = histogram, float(len(self.newest.cloud))
+        else:
+            self.appearance = self.appearance.lerp(histogram, _APPEARANCE_RATE)
+            self.appearance_points += _APPEARANCE_RATE * (len(self.newest.cloud) - self.appearance_points)
 
     def set_masks(self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool) -> None:
         """Set the masks of the newest frame.

@@ -17,7 +17,6 @@ from v3d_torch.objects.association import (
     class_log_ratio,
     overlap_log_ratio,
     position_log_ratio,
-    score_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
@@ -44,7 +43,6 @@ class DetectedInstances:
     Attributes:
         stamp: Timestamp, seconds.
         labels: Class of each of N instances, int64, shape :math:`(N,)`.
-        scores: Score of each instance, 0 if it has none, float32, shape :math:`(N,)`.
         detections: Detections of the instances.
         masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
         appearance: Colour histograms, float32, shape :math:`(N, D)`, NaN if unknown; None if they are not compared.
@@ -52,7 +50,6 @@ class DetectedInstances:
 
     stamp: float
     labels: Tensor
-    scores: Tensor
     detections: Sequence[Detection3D]
     masks: Tensor
     appearance: Tensor | None
@@ -110,7 +107,6 @@ def detect_instances(
     return DetectedInstances(
         stamp,
         instances.labels,
-        instances.scores,
         detections,
         pack_masks(instances.masks, stride),
         appearance,
@@ -186,7 +182,7 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     evidence = (
         _position_evidence(predicted.tracks, states, detected, possible)
         + overlap_log_ratio(coverage, overlap, visible)
-        + _appearance_evidence(predicted.tracks, detected)
+        + _appearance_evidence(predicted.tracks, detected, [len(track.newest.cloud) for track in predicted.tracks])
         + class_log_ratio(same_class)
         + torch.tensor([[track.vacancy] for track in predicted.tracks], dtype=torch.float64)
     )
@@ -195,6 +191,9 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
 
 def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Add up the evidence for each pair of a track without a predicted mask and an instance.
+
+    The last view of an object that left was small, and says little about what is visible when it returns: the views of
+    the mean appearance count.
 
     Args:
         tracks: T tracks.
@@ -209,9 +208,8 @@ def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, 
     possible = same_class & _within_gate(tracks, states, detected, config)
     evidence = (
         _position_evidence(tracks, states, detected, possible)
-        + _appearance_evidence(tracks, detected)
+        + _appearance_evidence(tracks, detected, [track.appearance_points for track in tracks])
         + class_log_ratio(same_class)
-        + score_log_ratio(detected.scores)
     )
     return evidence.masked_fill(~possible, -torch.inf)
 
@@ -229,15 +227,17 @@ def _position_evidence(
     return position_log_ratio(squared_distance, variance)
 
 
-def _appearance_evidence(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
-    """Evidence of appearance, shape (T, N); 0 if it is not compared."""
+def _appearance_evidence(
+    tracks: Sequence[Track], detected: DetectedInstances, tracked_points: Sequence[float]
+) -> Tensor:
+    """Evidence of appearance, shape (T, N), with the points of the views of the tracks; 0 if it is not compared."""
     if detected.appearance is None:
         return torch.zeros(len(tracks), len(detected), dtype=torch.float64)
     unknown = torch.full_like(detected.appearance[0], torch.nan)
     appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
     similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
     elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
-    tracked = torch.tensor([[len(track.newest.cloud)] for track in tracks], dtype=torch.float64)
+    tracked = torch.tensor(tracked_points, dtype=torch.float64)[:, None]
     points = torch.tensor([len(detection.cloud) for detection in detected.detections], dtype=torch.float64)
     return appearance_log_ratio(similarity, elapsed, torch.minimum(tracked, points), torch.maximum(tracked, points))
 
