@@ -773,7 +773,7 @@ def test_nothing_is_dynamic_without_free_space_evidence() -> None:
 @pytest.mark.parametrize(("label", "motion_state"), [(PERSON, MotionState.DYNAMIC), (CHAIR, MotionState.STATIC)])
 def test_furniture_of_which_little_is_known_to_have_appeared_is_static(label: int, motion_state: MotionState) -> None:
     """The view before did not observe most of the place of the object; what it observed was free."""
-    stage = ObjectStage(load_config(None, (STRIDE,)).objects)
+    stage = ObjectStage(load_config(None, (STRIDE, NO_UNLABELLED)).objects)
     wall = torch.full((1, CAMERA.height, CAMERA.width), WALL)
     wall[..., 60:] = 0.0
     nobody = Instances.empty(CAMERA.height, CAMERA.width)

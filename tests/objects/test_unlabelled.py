@@ -46,8 +46,12 @@ def rectangle(rows: slice, columns: slice) -> Tensor:
     return mask
 
 
+def instance(mask: Tensor, label: int) -> Instances:
+    return Instances(mask[None], torch.tensor([label]), torch.tensor([0.9]), torch.tensor([[60.0, 40.0, 100.0, 80.0]]))
+
+
 def person(mask: Tensor) -> Instances:
-    return Instances(mask[None], torch.tensor([PERSON]), torch.tensor([0.9]), torch.tensor([[60.0, 40.0, 100.0, 80.0]]))
+    return instance(mask, PERSON)
 
 
 REGION = slice(10, 20), slice(15, 25)  # rows and columns of `NewlyOccupied`
@@ -108,6 +112,14 @@ def test_region_covered_by_an_instance_is_not_proposed() -> None:
     assert len(propose(newly_occupied(REGION), person(MASK))) == 0
     elsewhere = rectangle(slice(0, 40), slice(0, 40))
     assert torch.equal(propose(newly_occupied(REGION), person(elsewhere)).masks, MASK[None])
+
+
+@pytest.mark.parametrize(("columns", "stays"), [(slice(60, 136), False), (slice(60, 144), True)])
+def test_region_in_a_thing_is_proposed_unless_most_of_the_thing_appeared(columns: slice, stays: bool) -> None:
+    """The region fills 40 columns of a table that stands still or moves; a mask of a person covers it in any case."""
+    mask = rectangle(slice(40, 80), columns)
+    assert bool(len(propose(newly_occupied(REGION), instance(mask, COCO_NAMES.index("dining table"))))) is stays
+    assert len(propose(newly_occupied(REGION), person(mask))) == 0
 
 
 def test_uncovered_part_of_a_region_is_proposed() -> None:

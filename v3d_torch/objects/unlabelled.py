@@ -1,7 +1,9 @@
-"""Unlabelled instances: newly occupied regions that no instance of the segmentation covers.
+"""Unlabelled instances: newly occupied regions that no instance of the segmentation explains.
 
 The network misses tilted or partly visible people, and has no class for a carried box. But the points of moving objects
 lie in space that an earlier view observed as free. Connected regions of such pixels become instances without a class.
+A person or animal explains all such pixels in its mask. A thing explains them only if it has moved itself: otherwise
+something else is in front of it, such as a box before a cupboard, or only this part of its mask moves.
 """
 
 from __future__ import annotations
@@ -12,9 +14,11 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.objects.mask_ops import upsample_nearest
+from v3d_torch.objects.motion_evidence import MOVED_FRACTION
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.segmentation.coco import UNLABELLED
+from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 from v3d_torch.types import Instances
 
 _OPENING_KERNEL = np.ones((3, 3), np.uint8)
@@ -28,7 +32,7 @@ _RIM_KERNEL = np.ones((5, 5), np.uint8)
 def unlabelled_instances(
     newly_occupied: NewlyOccupied, instances: Instances, depth: Tensor, camera: PinholeCamera, min_area: float
 ) -> Instances:
-    """Propose instances from newly occupied regions that no other instance covers.
+    """Propose instances from newly occupied regions that no other instance explains.
 
     Args:
         newly_occupied: Newly occupied pixels of the frame.
@@ -43,8 +47,9 @@ def unlabelled_instances(
     step, (height, width) = newly_occupied.stride, depth.shape[-2:]
     appeared = (newly_occupied.appeared == 1).any(dim=0).to(torch.uint8).numpy()
     appeared = cv2.morphologyEx(appeared, cv2.MORPH_OPEN, _OPENING_KERNEL)
-    covered = np.asarray(instances.masks.numpy()[:, ::step, ::step].any(axis=0), np.uint8)
-    appeared[cv2.dilate(covered, _RIM_KERNEL) > 0] = 0
+    coarse_masks = instances.masks[:, ::step, ::step].contiguous()
+    explained = _explained_pixels(instances.labels, coarse_masks, torch.from_numpy(appeared > 0))
+    appeared[cv2.dilate(explained.to(torch.uint8).numpy(), _RIM_KERNEL) > 0] = 0
     count, region = cv2.connectedComponents(appeared)
     pixel_area = np.square(depth[0, ::step, ::step].to(torch.float64).numpy() * step) / (camera.fx * camera.fy)
     area = np.bincount(region.ravel(), weights=pixel_area.ravel(), minlength=count)
@@ -53,3 +58,21 @@ def unlabelled_instances(
         return Instances.empty(height, width)
     masks = upsample_nearest(region == large[:, None, None], step, (height, width))
     return Instances.from_masks(masks, torch.full((len(large),), UNLABELLED))
+
+
+def _explained_pixels(labels: Tensor, masks: Tensor, appeared: Tensor) -> Tensor:
+    """Return the pixels of the instances that can move by themselves, or of which most appeared.
+
+    Args:
+        labels: Class indices of N instances, int64, shape (N,).
+        masks: Pixels of the instances, bool, shape (N, h, w).
+        appeared: Newly occupied pixels, bool, shape (h, w).
+
+    Returns:
+        Bool, shape (h, w).
+    """
+    packed = pack_masks(masks)
+    new = count_common_pixels(packed, pack_masks(appeared[None]))[:, 0]
+    is_rigid = torch.tensor([label in RIGID for label in labels.tolist()], dtype=torch.bool)
+    explains = ~is_rigid | (new >= MOVED_FRACTION * count_pixels(packed))
+    return torch.from_numpy(masks[explains].numpy().any(axis=0))  # NumPy is faster here than torch
