@@ -234,7 +234,8 @@ class V3DSLAM(FramePreprocessor):
             is_propagated = instances.track_ids is not None  # their ids are known without a comparison
             appearance = None if is_propagated else self.describe_appearance(frame.image, clouds.cloud_pixels)
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
-            support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)))
+            residuals = motion.residuals(self._previous, features, self.camera)
+            support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)), residuals)
             objects = self.classify_motion(instances, clouds, view, newly_occupied, support, appearance)
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features

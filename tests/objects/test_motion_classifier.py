@@ -434,6 +434,37 @@ def test_person_with_supporting_features_is_static_after_a_third_of_a_second(
     assert obj.motion_state is motion_state
 
 
+@pytest.mark.parametrize(
+    ("step", "enabled", "since"),
+    [(1.0, "true", 3), (0.1, "true", None), (1.0, "false", None)],
+    ids=["moving", "noise", "without features"],
+)
+def test_thing_whose_features_shift_is_dynamic_until_they_have_not_for_a_second(
+    step: float, enabled: str, since: int | None
+) -> None:
+    """A screen moves along its own plane: its depth does not change, so that only features show the motion.
+
+    In one frame its features move by ``step`` pixels; they are not matched while it is masked.
+    """
+    depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
+    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mask[:, 30:90, 50:110] = True
+    screen = Instances(mask, torch.tensor([62]), torch.tensor([0.9]), torch.zeros(1, 4))
+    pixel = torch.cartesian_prod(torch.arange(2, CAMERA.width, 5), torch.arange(2, CAMERA.height, 5))
+    residuals = torch.zeros(len(pixel), 2, dtype=torch.float64)
+    residuals[mask[0, pixel[:, 1], pixel[:, 0]], 0] = step
+    fits = torch.ones(len(pixel), dtype=torch.bool)
+    stage = ObjectStage(load_config(None, (f"objects.feature_shift.enabled={enabled}",)).objects)
+    dynamic = []
+    for frame in range(50):
+        seen = torch.where((residuals != 0) & (frame > 8), torch.nan, residuals)
+        stage.feature_support = FeatureSupport(pixel, fits, seen)
+        (obj,) = stage(frame / 30, screen, depth, HERE).objects
+        dynamic.append(obj.motion_state is MotionState.DYNAMIC)
+    expected = range(0) if since is None else range(since, 8 + 31)
+    assert [frame for frame in range(50) if dynamic[frame]] == list(expected)
+
+
 @pytest.mark.parametrize("label", [PERSON, DOG])
 @pytest.mark.parametrize(("enabled", "motion_state"), [("true", MotionState.STATIC), ("false", MotionState.UNKNOWN)])
 def test_new_detection_of_old_surface_is_static_at_once(label: int, enabled: str, motion_state: MotionState) -> None:

@@ -110,6 +110,23 @@ def test_inlier_mask_selects_the_matched_features_of_the_current_frame() -> None
     assert not replace(motion, pairs=PAIRS[:0]).inlier_mask(7).any()
 
 
+def test_residuals_are_displacements_against_the_motion(demo: RGBDSequence) -> None:
+    """Matched features lie where the measured motion moves the points of the previous frame, nearly all by a pixel."""
+    frames = two_frames(demo, 0, 1)
+    motion = frames.estimate()
+    residuals = motion.residuals(frames.previous, frames.current.features, demo.camera)
+    assert residuals.shape == (len(frames.current.features), 2)
+    matched = residuals[:, 0].isfinite()
+    assert set(motion.matches[:, 1].tolist()) == set(torch.nonzero(matched)[:, 0].tolist())
+    inliers = motion.inlier_mask(len(residuals))
+    assert bool(matched[inliers].all()) and int(matched.sum()) > int(inliers.sum())
+    assert residuals[inliers].norm(dim=1).median() < 1.0
+    moved = replace(frames.current.features, uv=frames.current.features.uv + torch.tensor([3.0, -2.0]).double())
+    difference = motion.residuals(frames.previous, moved, demo.camera) - residuals
+    torch.testing.assert_close(difference[matched], torch.tensor([3.0, -2.0]).double().expand(int(matched.sum()), 2))
+    assert motion.residuals(None, moved, demo.camera).isnan().all()
+
+
 def test_landmarks_are_propagated_by_the_inlier_matches(demo: RGBDSequence) -> None:
     motion = CameraMotion(PREDICTED_T_CP, PREDICTED_VELOCITY, PAIRS, is_measured=True)
     previous = replace(two_frames(demo, 0, 1).previous, landmarks=torch.tensor([10, 11, -1, 13, 14]))

@@ -155,6 +155,20 @@ class FreeSpaceConfig(Section):
     """Minimum number of visible points for a decision."""
 
 
+class FeatureShiftConfig(Section):
+    """Shift of the features on an object against the camera motion.
+
+    It shows slow motions of textured things before free space does: a screen that is moved sideways uncovers half of
+    its place only after half of its width.
+    """
+
+    enabled: bool = True
+    """False for the paper's rules."""
+    time_span: float = Field(0.3, gt=0, le=1)
+    """Time over which shifts are added up, seconds, the shorter one of the free-space check: within it, something that
+    is pushed hardly changes its direction."""
+
+
 class ChamferConfig(Section):
     """Intra-object motion by Chamfer distance (paper, Sec. III-D)."""
 
@@ -215,6 +229,7 @@ class ObjectsConfig(Section):
     tracker: TrackerConfig = TrackerConfig()
     voting: VotingConfig = VotingConfig()
     free_space: FreeSpaceConfig = FreeSpaceConfig()
+    feature_shift: FeatureShiftConfig = FeatureShiftConfig()
     chamfer: ChamferConfig = ChamferConfig()
     static_mask: StaticMaskConfig = StaticMaskConfig()
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from v3d_torch.objects.feature_shift import FeatureShift, feature_shifts
+
 MIN_SUPPORT_RATIO = 0.5
 """Minimum inlier ratio of the features of a supported object, as a fraction of the inlier ratio outside of all objects:
 on a static object both are similar, on a walking person nearly no feature is an inlier."""
@@ -33,10 +35,13 @@ class FeatureSupport:
         pixel: Pixel (column, row) of each feature, int64, shape :math:`(N, 2)`.
         inliers: Mask of the features that are matched to the previous frame and fit the camera motion, bool, shape
             :math:`(N,)`.
+        residuals: Displacement of each feature against the camera motion, pixels, float64, shape :math:`(N, 2)`; NaN
+            for features without a match. None if displacements are not measured.
     """
 
     pixel: Tensor
     inliers: Tensor
+    residuals: Tensor | None = None
 
     def supports(
         self, masks: Sequence[Tensor], min_ratio: float = MIN_SUPPORT_RATIO, min_inliers: int = MIN_SUPPORTING_FEATURES
@@ -61,3 +66,7 @@ class FeatureSupport:
             outside_ratio = outside_ratio.clamp(min=_USUAL_INLIER_RATIO)
         counts, features = (inside & self.inliers).sum(dim=1), inside.sum(dim=1)
         return (counts >= min_inliers) & (counts >= min_ratio * outside_ratio * features)
+
+    def shifts(self, masks: Sequence[Tensor]) -> list[FeatureShift | None]:
+        """Measure how far the features on objects move together, see `feature_shifts`; None if this is not known."""
+        return [None] * len(masks) if self.residuals is None else feature_shifts(self.pixel, self.residuals, masks)

@@ -97,7 +97,9 @@ class MotionClassifier:
 
         # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
         vote = hough_vote_evidence(detected, pairs, free_space, self._last_stamp, config.voting)
-        for track in vote.dynamic:
+        # Independent evidence, not in the paper: features, which show slow motions earlier.
+        shifted = self._shifted_tracks(tracks, feature_support, stamp)
+        for track in vote.dynamic | shifted:
             track.mark_dynamic(stamp)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
@@ -176,6 +178,15 @@ class MotionClassifier:
             if track.label in LIVING and not self._is_held_dynamic(track, stamp)
         }
 
+    def _shifted_tracks(self, tracks: Sequence[Track], feature_support: FeatureSupport, stamp: float) -> set[Track]:
+        """Return the objects whose features have moved against the camera motion."""
+        config = self._config.feature_shift
+        if not config.enabled:
+            return set()
+        for track, shift in zip(tracks, feature_support.shifts([each.mask for each in tracks]), strict=True):
+            track.add_shift(stamp, shift, config.time_span)
+        return {track for track in tracks if track.last_shifted == stamp}
+
     def _motion_state(self, track: Track, appeared: list[float], stamp: float) -> MotionState:
         """Return the motion state of an object.
 
@@ -185,7 +196,9 @@ class MotionClassifier:
             stamp: Timestamp of the frame, seconds.
         """
         config = self._config.static_mask
-        if track.last_dynamic == stamp:
+        # While it is masked, its features are not matched, and free space does not show slow motions.
+        has_shifted = stamp - track.last_shifted <= config.hold_dynamic_time
+        if track.last_dynamic == stamp or has_shifted:
             return MotionState.DYNAMIC
         at_rest = [fraction < _STATIC_FRACTION for fraction in appeared]
         at_rest_over_all = len(at_rest) > 0 and all(at_rest)

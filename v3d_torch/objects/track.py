@@ -12,6 +12,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.association import vacancy_log_ratio
+from v3d_torch.objects.feature_shift import FeatureShift, sum_shifts
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
@@ -40,6 +41,10 @@ _CONFIRMING_DYNAMIC_FRAMES = 2
 
 _APPEARANCE_RATE = 0.1
 """Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
+
+_MIN_SHIFT_TIME = 1 / 3
+"""Minimum time over which shifts have been added up, as a fraction of the whole: the features of a single frame can all
+be matched wrongly, on a repeated pattern."""
 
 _DETECTION_TIME = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest time span of the vote."""
@@ -82,7 +87,7 @@ class Track:
 
     The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
     masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` and
-    ``last_deforming`` record the results of votes and Chamfer distances.
+    ``last_deforming`` record the results of votes and Chamfer distances, ``last_shifted`` those of features.
 
     Args:
         config: Noise and maximum speed of the Kalman filter.
@@ -111,6 +116,7 @@ class Track:
         last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
         supported_since: Timestamp of the first frame since which its features have fitted the camera motion in every
             frame, seconds; infinity if they did not in the newest frame.
+        last_shifted: Timestamp of the last frame in which its features had moved against the camera motion, seconds.
         history: States of the visible part after detections of the last 10 s, oldest first.
     """
 
@@ -135,12 +141,14 @@ class Track:
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
     supported_since: float = torch.inf
+    last_shifted: float = -torch.inf
 
     def __post_init__(self, config: TrackerConfig) -> None:
         self.history: list[ObjectState] = []
         self._config = config
         self._filter = ConstantVelocityKalmanFilter(config)
         self._max_points = 1
+        self._shifts: list[tuple[float, FeatureShift]] = []  # by the time of the frame
 
     @property
     def newest(self) -> Detection3D:
@@ -269,6 +277,7 @@ class Track:
         """
         self.first_stamp = stamp
         self.supported_since = torch.inf
+        self._shifts = []
         self.detections = []
 
     def update_label(self, label: int, score: float) -> None:
@@ -318,6 +327,22 @@ class Track:
         self.last_dynamic = stamp
         self.dynamic_frames += 1
         self.is_confirmed = self.is_confirmed or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
+
+    def add_shift(self, stamp: float, shift: FeatureShift | None, time_span: float) -> None:
+        """Add the shift of the features on the object in a frame, and record a motion if the sum shows one.
+
+        Args:
+            stamp: Timestamp of the frame, seconds.
+            shift: Shift since the previous frame; None if it is not known.
+            time_span: Time over which shifts are added up, seconds.
+        """
+        self._shifts = [each for each in self._shifts if stamp - each[0] < time_span + STAMP_TOLERANCE]
+        if shift is None:
+            return
+        self._shifts.append((stamp, shift))
+        is_long = stamp - self._shifts[0][0] >= _MIN_SHIFT_TIME * time_span - STAMP_TOLERANCE
+        if is_long and sum_shifts(each for _, each in self._shifts).is_motion:
+            self.last_shifted = stamp
 
     def mark_deforming(self, stamp: float) -> None:
         """Record that the object deforms in the frame at ``stamp``, seconds."""

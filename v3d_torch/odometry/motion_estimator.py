@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -30,6 +30,11 @@ _MAX_ROTATION_RATE = 6.3
 """Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
 
 
+def no_pairs() -> Tensor:
+    """Return an empty list of matches, int64, shape (0, 2)."""
+    return torch.zeros(0, 2, dtype=torch.int64)
+
+
 @dataclass(frozen=True)
 class RelativeMotion:
     """Rigid motion of the camera from view "a" to view "b".
@@ -38,10 +43,13 @@ class RelativeMotion:
         T_ba: Maps points from camera a to camera b, float64, shape :math:`(4, 4)`.
         pairs: Inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`; K = 0 for a motion found by
             dense alignment.
+        matches: All matches by descriptors, inliers and outliers (feature of a, feature of b), int64, shape
+            :math:`(M, 2)`.
     """
 
     T_ba: Tensor
     pairs: Tensor
+    matches: Tensor = field(default_factory=no_pairs, kw_only=True)
 
     @cached_property
     def xi(self) -> Tensor:
@@ -125,7 +133,7 @@ class MotionEstimator:
             a.descriptors[selected], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
         )
         matched = torch.nonzero(matches >= 0)[:, 0]
-        pairs = torch.stack([selected[matched], matches[matched]], dim=1)
+        pairs = candidates = torch.stack([selected[matched], matches[matched]], dim=1)
         if pairs.shape[0] < config.min_inliers:
             return None
         epipolar = epipolar_inliers(
@@ -149,5 +157,5 @@ class MotionEstimator:
         )
         if int(pose.inliers.sum()) < config.min_inliers:
             return None
-        motion = RelativeMotion(pose.T_cw, pairs[pose.inliers])
+        motion = RelativeMotion(pose.T_cw, pairs[pose.inliers], matches=candidates)
         return motion if motion.is_plausible(elapsed, config.max_speed) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from kornia.color import rgb_to_grayscale
@@ -13,7 +13,7 @@ from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.dense_aligner import DenseAligner
 from v3d_torch.odometry.dense_view import DenseView
-from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion
+from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion, no_pairs
 from v3d_torch.types import RGBDFrame
 
 
@@ -47,18 +47,39 @@ class CameraMotion:
         pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape
             :math:`(K, 2)`; K = 0 for a motion found by dense alignment, and for a prediction.
         is_measured: True if the frames were registered, False if the motion is only predicted.
+        matches: All matches by descriptors, inliers and outliers, in the same form as ``pairs``, shape :math:`(M, 2)`.
     """
 
     T_cp: Tensor
     velocity: Tensor
     pairs: Tensor
     is_measured: bool
+    matches: Tensor = field(default_factory=no_pairs, kw_only=True)
 
     def inlier_mask(self, count: int) -> Tensor:
         """Mask of the features of the current frame that are inliers, bool, shape ``(count,)``."""
         mask = torch.zeros(count, dtype=torch.bool)
         mask[self.pairs[:, 1]] = True
         return mask
+
+    def residuals(self, previous: TrackedFrame | None, features: Features, camera: PinholeCamera) -> Tensor:
+        """Difference of the matched features from where they would be if the scene stood still.
+
+        Args:
+            previous: Previous frame; None if there is none.
+            features: N features of the current frame.
+            camera: Camera of both frames.
+
+        Returns:
+            Measured minus expected position, pixels, float64, shape :math:`(N, 2)`; NaN for features without a match.
+        """
+        residuals = torch.full((len(features), 2), torch.nan, dtype=torch.float64)
+        if previous is not None and len(self.matches):
+            before, now = self.matches.unbind(dim=1)
+            points = camera.back_project(previous.features.uv[before], previous.features.depth[before])
+            expected = camera.project(points @ self.T_cp[:3, :3].T + self.T_cp[:3, 3])
+            residuals[now] = features.uv[now] - expected
+        return residuals
 
     def propagate_landmarks(self, previous: TrackedFrame | None, count: int) -> Tensor:
         """Landmark IDs of the features of the current frame, propagated by the inlier matches.
@@ -105,9 +126,10 @@ class Odometry:
         """
         motion = None if previous is None else self.register(previous, current, T_cp)
         if previous is None or motion is None:
-            return CameraMotion(T_cp, velocity, torch.zeros(0, 2, dtype=torch.int64), is_measured=False)
+            return CameraMotion(T_cp, velocity, no_pairs(), is_measured=False)
         elapsed = current.frame.stamp - previous.frame.stamp
-        return CameraMotion(motion.T_ba, motion.velocity(elapsed), motion.pairs, is_measured=True)
+        velocity = motion.velocity(elapsed)
+        return CameraMotion(motion.T_ba, velocity, motion.pairs, is_measured=True, matches=motion.matches)
 
     def register(self, previous: TrackedFrame, current: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
         """Register two frames: the motion from an earlier frame "a" to a later frame "b".
@@ -127,7 +149,7 @@ class Odometry:
         alignment = self._align.align_views(self._dense_view(previous), self._dense_view(current), T_ba)
         if alignment is None:
             return None
-        motion = RelativeMotion(alignment.T_ba, torch.zeros(0, 2, dtype=torch.int64))
+        motion = RelativeMotion(alignment.T_ba, no_pairs())
         return motion if motion.is_plausible(elapsed, self._max_speed) else None
 
     def _dense_view(self, tracked: TrackedFrame) -> DenseView:

@@ -14,6 +14,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.objects.feature_shift import FeatureShift
 from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
@@ -34,7 +35,7 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 STATE_CLASSES: tuple[type, ...] = (
     TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, TrackingStatus, CameraState,
     Keyframe, Loop, TensorTable, Readout, StageTime,
-    StoredView, Track, Detection3D, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig,
+    StoredView, Track, Detection3D, FeatureShift, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig,
     RangeView, Floor, UpDirection,
 )  # fmt: skip
 """Classes of the package that a saved state can contain; others are not read."""

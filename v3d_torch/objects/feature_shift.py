@@ -1,0 +1,112 @@
+"""Shift of features: how far the features on an object move together, against the camera motion.
+
+Features on a static object are where the camera motion moves them, up to noise. Those on a moving object are displaced,
+all in the same direction. In one frame a slow motion is smaller than the noise, but within some tenths of a second the
+displacements add up. The displacements of other parts of the image, which stand still, show how much of a sum is due to
+errors of the camera motion, of the depth and of the rolling shutter.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+_MIN_FEATURES = 8
+"""Minimum number of matched features whose median is known well enough."""
+
+_GRID = (3, 4)
+"""Rows and columns of the cells of an image whose features are compared with those of an object, which is about as
+large."""
+
+_MIN_CELLS = 3
+"""Minimum number of cells with enough features, so that not all of them are on one moving object."""
+
+_QUANTILE = 0.9
+"""Quantile of the displacements of the cells that a moving object exceeds: where the lens model or the depth is wrong,
+static places are displaced, too."""
+
+_MIN_SIGMAS = 4.0
+"""Minimum shift of a moving object beyond that of other places, in standard deviations: an object is tested in every
+frame, and a wrong decision lasts for a second."""
+
+_MIN_SIGMA = 0.25
+"""Minimum standard deviation of a shift, pixels: positions of features are hardly more accurate."""
+
+_SIGMA_OF_MEDIAN = 1.4826
+"""Standard deviation of normally distributed values, relative to their median absolute deviation."""
+
+
+@dataclass(frozen=True)
+class FeatureShift:
+    """Shift of the features on an object, in one frame or summed over several.
+
+    Attributes:
+        pixels: Median displacement, along u and v, pixels.
+        variance: Variance of its noise, of both axes together, square pixels.
+        elsewhere: Displacement of nearly all other places of the image, pixels; infinite if it is not known.
+    """
+
+    pixels: tuple[float, float]
+    variance: float
+    elsewhere: float
+
+    @property
+    def is_motion(self) -> bool:
+        """True if the object has moved: it is displaced significantly more than other places."""
+        return math.hypot(*self.pixels) > self.elsewhere + _MIN_SIGMAS * max(math.sqrt(self.variance), _MIN_SIGMA)
+
+
+def sum_shifts(shifts: Iterable[FeatureShift]) -> FeatureShift:
+    """Add up the shifts of consecutive frames. Noise is independent, displacements elsewhere have one direction."""
+    pixels, variances, elsewhere = zip(*((each.pixels, each.variance, each.elsewhere) for each in shifts), strict=True)
+    u, v = zip(*pixels, strict=True)
+    return FeatureShift((sum(u), sum(v)), sum(variances), sum(elsewhere))
+
+
+def feature_shifts(pixel: Tensor, residuals: Tensor, masks: Sequence[Tensor]) -> list[FeatureShift | None]:
+    """Measure the shift of each object in a frame.
+
+    Args:
+        pixel: Pixel (column, row) of each feature, int64, shape :math:`(N, 2)`.
+        residuals: Displacement of each feature against the camera motion, pixels, float64, shape :math:`(N, 2)`; NaN if
+            it is not known.
+        masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
+
+    Returns:
+        Shift of each object; None if too few displacements are known.
+    """
+    known = torch.nonzero(residuals.isfinite().all(dim=1))[:, 0]
+    if len(masks) == 0 or len(known) < _MIN_FEATURES:
+        return [None] * len(masks)
+    (u, v), displacement = pixel[known].T, residuals[known].numpy()
+    inside = torch.stack([mask[v, u] for mask in masks]).numpy()
+    if (inside.sum(axis=1) < _MIN_FEATURES).all():
+        return [None] * len(masks)
+    height, width = masks[0].shape
+    cell = (v * _GRID[0] // height * _GRID[1] + u * _GRID[1] // width).numpy()
+    outside = ~inside.any(axis=0)
+    elsewhere = _displacement_of_cells(displacement[outside], cell[outside])
+    return [_shift(each, elsewhere) if _is_enough(each := displacement[on_object]) else None for on_object in inside]
+
+
+def _is_enough(displacement: NDArray[np.float64]) -> bool:
+    return len(displacement) >= _MIN_FEATURES
+
+
+def _displacement_of_cells(displacement: NDArray[np.float64], cell: NDArray[np.int64]) -> float:
+    """Return the displacement of nearly all cells, pixels; infinite with too few cells."""
+    of_cells = (displacement[cell == k] for k in range(_GRID[0] * _GRID[1]))
+    medians = [np.median(each, axis=0) for each in of_cells if _is_enough(each)]
+    return float(np.quantile(np.hypot(*np.transpose(medians)), _QUANTILE)) if len(medians) >= _MIN_CELLS else math.inf
+
+
+def _shift(displacement: NDArray[np.float64], elsewhere: float) -> FeatureShift:
+    median = np.median(displacement, axis=0)
+    sigma = _SIGMA_OF_MEDIAN * np.median(np.abs(displacement - median), axis=0)
+    return FeatureShift(tuple(median.tolist()), float(np.square(sigma).sum()) / len(displacement), elsewhere)
