@@ -14,6 +14,7 @@ from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.io.state_file import write_state
+from v3d_torch.objects.feature_shift import FeatureShift
 from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
@@ -48,6 +49,17 @@ def test_loaded_system_gives_the_same_next_results(saved_after: int, tmp_path: P
         assert list(differences(slam(walk[index]), loaded(walk[index]), f"frame {index}", {})) == []
     slam.flush(), loaded.flush()
     assert list(differences(slam, loaded, "slam", {})) == []
+
+
+def test_state_has_the_shifts_of_features(tmp_path: Path) -> None:
+    slam, walk = V3DSLAM(CAMERA, segment_red, CONFIG), Walk()
+    for index in range(3):
+        slam(walk[index])
+    (track, *_) = slam.classify_motion.tracker.tracks
+    track.add_shift(track.newest.stamp, FeatureShift((3.0, 4.0), 0.5, 0.1), 0.3)
+    save_state(tmp_path / "slam.state", slam)
+    loaded = load_state(tmp_path / "slam.state", segment_red)
+    assert list(differences(slam.state_dict(), loaded.state_dict(), "state", {})) == []
 
 
 def test_state_from_before_the_first_frame_also_restores_the_segmenter() -> None:
