@@ -102,11 +102,17 @@ def _is_enough(displacement: NDArray[np.float64]) -> bool:
 def _displacement_of_cells(displacement: NDArray[np.float64], cell: NDArray[np.int64]) -> float:
     """Return the displacement of nearly all cells, pixels; infinite with too few cells."""
     of_cells = (displacement[cell == k] for k in range(_GRID[0] * _GRID[1]))
-    medians = [np.median(each, axis=0) for each in of_cells if _is_enough(each)]
+    medians = [_median(each) for each in of_cells if _is_enough(each)]
     return float(np.quantile(np.hypot(*np.transpose(medians)), _QUANTILE)) if len(medians) >= _MIN_CELLS else math.inf
 
 
 def _shift(displacement: NDArray[np.float64], elsewhere: float) -> FeatureShift:
-    median = np.median(displacement, axis=0)
-    sigma = _SIGMA_OF_MEDIAN * np.median(np.abs(displacement - median), axis=0)
+    median = _median(displacement)
+    sigma = _SIGMA_OF_MEDIAN * _median(np.abs(displacement - median))
     return FeatureShift(tuple(median.tolist()), float(np.square(sigma).sum()) / len(displacement), elsewhere)
+
+
+def _median(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Median of each column; for few values faster than that of NumPy."""
+    ordered, count = np.sort(values, axis=0), len(values)
+    return np.asarray((ordered[(count - 1) // 2] + ordered[count // 2]) / 2, np.float64)
