@@ -404,6 +404,16 @@ def test_standing_person_is_unknown_before_static(rate: float) -> None:
             assert frame[2].motion_state is MotionState.STATIC
 
 
+@pytest.mark.parametrize(("second", "motion_state"), [(PERSON, MotionState.UNKNOWN), (CHAIR, MotionState.STATIC)])
+def test_new_object_that_was_detected_as_a_person_once_is_unknown(second: int, motion_state: MotionState) -> None:
+    depth, owner = render([walker((0.0, 0.1, 2.5), (0.0, 0.0, 0.0))], 0.0, HERE, noise=0.0)
+    stage = ObjectStage(load_config(None, (STRIDE,)).objects)
+    for frame, label in enumerate((CHAIR, second, CHAIR, CHAIR)):
+        instances = detect(owner, [static_box((0.0, 0.0, 0.0), label=label)], set())
+        (obj,) = stage(frame / 15, instances, depth, HERE).objects
+    assert (obj.label, obj.motion_state) == (CHAIR, motion_state)
+
+
 @pytest.mark.parametrize(
     ("fitting", "interruption", "motion_state"),
     [(1.0, None, MotionState.STATIC), (0.2, None, MotionState.UNKNOWN), (1.0, 4, MotionState.UNKNOWN)],

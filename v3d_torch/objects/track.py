@@ -15,7 +15,7 @@ from v3d_torch.objects.association import vacancy_log_ratio
 from v3d_torch.objects.feature_shift import FeatureShift, sum_shifts
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
-from v3d_torch.segmentation.coco import RIGID, UNLABELLED
+from v3d_torch.segmentation.coco import LIVING, RIGID, UNLABELLED
 
 _WHOLE_SIGMA = 0.05
 """Standard deviation of the centroid of a fully visible object from that of the object, metres: arms and legs swing by
@@ -159,6 +159,11 @@ class Track:
     def may_move(self) -> bool:
         """True if the object can move by itself or has moved; false for furniture that was always at rest."""
         return self.label not in RIGID or self.last_dynamic > -torch.inf
+
+    @property
+    def may_live(self) -> bool:
+        """True if any detection was that of a person or an animal, whatever the class of most detections."""
+        return not LIVING.isdisjoint(self.labels)
 
     @property
     def velocity(self) -> Tensor:
