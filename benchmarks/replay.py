@@ -1,4 +1,4 @@
-"""Frames of a sequence in a given order: its beginning, or forwards and backwards for any number of frames."""
+"""Frames of a sequence in a given order: its beginning, again and again, or forwards and backwards."""
 
 from __future__ import annotations
 
@@ -31,6 +31,11 @@ class Replay(StoredSequence):
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         frame = self._sequence[self._indices[index]]
         return frame.image, frame.depth
+
+
+def again_and_again(count: int, frames: int) -> list[int]:
+    """Return ``frames`` indices that run through ``count`` frames, and start again after the last one."""
+    return [index % count for index in range(frames)]
 
 
 def back_and_forth(count: int, frames: int) -> list[int]:

@@ -119,9 +119,8 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
         Part(
             "growth",
             (
-                "A sequence is played forwards and backwards. Time per frame and number of keyframes should stay"
-                " constant, because the camera observes the same room. CPU ms per frame is given for each tenth of the"
-                " run."
+                "A sequence is played again and again. Time per frame and number of keyframes should stay constant,"
+                " because the camera observes the same room. CPU ms per frame is given for each tenth of the run."
             ),
             flat_table(columns.GROWTH),
             key="frames",

@@ -29,7 +29,7 @@ import storage
 import tables
 import write_page
 from heading import Heading
-from replay import Replay, back_and_forth
+from replay import Replay, again_and_again, back_and_forth
 from systems import OURS, vocabulary
 from systems.process import Measured, SystemRunError, measure
 
@@ -54,6 +54,9 @@ def test_script_can_be_imported(name: str) -> None:
 
 
 class TestReplay:
+    def test_again_and_again_starts_anew_after_the_last_frame(self) -> None:
+        assert again_and_again(4, 9) == [0, 1, 2, 3, 0, 1, 2, 3, 0]
+
     def test_back_and_forth_turns_at_the_ends(self) -> None:
         assert back_and_forth(4, 11) == [0, 1, 2, 3, 2, 1, 0, 1, 2, 3, 2]
 
