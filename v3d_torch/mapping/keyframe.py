@@ -64,8 +64,8 @@ class Keyframe:
 
 def stack_poses(keyframes: Sequence[Keyframe]) -> Tensor:
     """Return the world-to-camera poses of keyframes, float64, shape :math:`(K, 4, 4)`; K can be 0."""
-    poses = [keyframe.T_cw[None] for keyframe in keyframes]
-    return torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *poses])
+    poses = [keyframe.T_cw for keyframe in keyframes]
+    return torch.stack(poses) if poses else torch.zeros(0, 4, 4, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
