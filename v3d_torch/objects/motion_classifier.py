@@ -216,7 +216,7 @@ class MotionClassifier:
         # Without a centroid, for example because the object is too far for its depth, its motion is never measured.
         is_new = stamp - track.first_stamp < config.confirm_static_time or not track.newest.has_centroid
         is_supported = stamp - track.supported_since >= _MIN_SUPPORTED_TIME - STAMP_TOLERANCE
-        if track.may_live and is_new and not at_rest_over_all and not is_supported:
+        if track.may_be_living and is_new and not at_rest_over_all and not is_supported:
             return MotionState.UNKNOWN
         return MotionState.STATIC
 

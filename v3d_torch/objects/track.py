@@ -161,7 +161,7 @@ class Track:
         return self.label not in RIGID or self.last_dynamic > -torch.inf
 
     @property
-    def may_live(self) -> bool:
+    def may_be_living(self) -> bool:
         """True if any detection was that of a person or an animal, whatever the class of most detections."""
         return not LIVING.isdisjoint(self.labels)
 
