@@ -1,8 +1,8 @@
 """Cost and accuracy of smaller and faster segmentation networks, and of segmentation of fewer frames, as Markdown.
 
 ``python benchmarks/segmentation.py --seqs walkers_desk crowd_rpy`` runs each sequence with the network in other
-precisions, sizes and models, and with the network on every second or third frame only; in between, objects are
-predicted as missed objects are. If a sequence has true masks, the whole system is scored with them.
+precisions, sizes and models, and with the network on every second or third frame only; in between, masks are
+propagated (``segmentation.interval``). If a sequence has true masks, the whole system is scored with them.
 """
 
 from __future__ import annotations
@@ -38,45 +38,31 @@ REFERENCE = "yolov8n 640x480, 32 bits"
 FULL = ("segmentation.width=640", "segmentation.height=480")
 
 
-@dataclass(frozen=True)
-class Variant:
-    """Segmentation variant.
-
-    Attributes:
-        overrides: Configuration values over the defaults.
-        every: Interval between frames with the network, frames.
-    """
-
-    overrides: tuple[str, ...] = ()
-    every: int = 1
-
-
-VARIANTS: Mapping[str, Variant] = {
-    REFERENCE: Variant((*FULL, "segmentation.precision=float32")),
-    "8 bits, 640x480": Variant(FULL),
-    "8 bits, 512x384": Variant(("segmentation.width=512", "segmentation.height=384")),
-    "8 bits, 416x320 (the default)": Variant(),
-    "8 bits, 320x256": Variant(("segmentation.width=320", "segmentation.height=256")),
-    "8 bits, yolo11n": Variant(("segmentation.model=yolo11n-seg",)),
-    "8 bits, yolo26n": Variant(("segmentation.model=yolo26n-seg",)),
-    "8 bits, every 2nd frame": Variant(every=2),
-    "8 bits, every 3rd frame": Variant(every=3),
+VARIANTS: Mapping[str, tuple[str, ...]] = {
+    REFERENCE: (*FULL, "segmentation.precision=float32"),
+    "8 bits, 640x480": FULL,
+    "8 bits, 512x384": ("segmentation.width=512", "segmentation.height=384"),
+    "8 bits, 416x320 (the default)": (),
+    "8 bits, 320x256": ("segmentation.width=320", "segmentation.height=256"),
+    "8 bits, yolo11n": ("segmentation.model=yolo11n-seg",),
+    "8 bits, yolo26n": ("segmentation.model=yolo26n-seg",),
+    "8 bits, every 2nd frame": ("segmentation.interval=2",),
+    "8 bits, every 3rd frame": ("segmentation.interval=3",),
 }
+"""Configuration values over the defaults, by the name of the variant."""
 
 
 @dataclass
 class MeasuredSegmenter:
-    """Segmenter that runs on every n-th frame and stores its times and the masks of people.
+    """Segmenter that stores its times and the masks of people.
 
     Attributes:
         segment: Segmenter to run.
-        every: Interval between its frames, frames.
         seconds: Time of each of its runs, seconds.
         people: Union of the masks of people by frame index, bool, shape :math:`(H, W)`.
     """
 
     segment: Segmenter
-    every: int
     seconds: list[float] = field(default_factory=list)
     people: dict[int, Tensor] = field(default_factory=dict)
 
@@ -85,9 +71,7 @@ class MeasuredSegmenter:
         return self.segment_with_pose(frame, None)
 
     def segment_with_pose(self, frame: RGBDFrame, T_cw: Tensor | None) -> Instances:
-        """Segment every n-th frame; the frames in between have no instances."""
-        if frame.index % self.every:
-            return Instances.empty(*frame.image.shape[1:])
+        """Segment a frame, and store the time and the people."""
         begin = time.perf_counter()
         instances = segment_frame(self.segment, frame, T_cw)
         self.seconds.append(time.perf_counter() - begin)
@@ -98,10 +82,10 @@ class MeasuredSegmenter:
 def compare(sequence: RGBDSequence) -> Iterator[Row]:
     """Yield a row per variant."""
     reference: dict[int, Tensor] = {}
-    for name, variant in VARIANTS.items():
-        config = load_config(overrides=[*SERIAL, *variant.overrides])
+    for name, overrides in VARIANTS.items():
+        config = load_config(overrides=[*SERIAL, *overrides])
         set_num_threads(config.threads)
-        segmenter = MeasuredSegmenter(make_segmenter(config, sequence.camera), variant.every)
+        segmenter = MeasuredSegmenter(make_segmenter(config, sequence.camera))
         pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, segmenter, config))
         run = pipeline()
         if run.failure is not None:
@@ -117,7 +101,7 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
         yield {
             "sequence": table_name(sequence),
             "network": name,
-            "ms": f"{1e3 * median(segmenter.seconds) / variant.every:.0f}",
+            "ms": f"{1e3 * median(segmenter.seconds) / config.segmentation.interval:.0f}",
             "people_found": format_value(found / expected if expected else None, ".1%"),
             "moving_masked": format_value(scores.moving_masked if scores else None, ".1%"),
             "static_masked": format_value(scores.static_masked if scores else None, ".1%"),
