@@ -7,9 +7,12 @@ neighbouring bins, so that a change of light changes the histogram little.
 
 from __future__ import annotations
 
-import cv2
+from functools import cache
+
 import numpy as np
 import torch
+from kornia.color import rgb_to_lab
+from numpy.typing import NDArray
 from torch import Tensor
 
 _BINS = 8
@@ -18,9 +21,17 @@ _BINS = 8
 HISTOGRAM_SIZE = _BINS**3
 """Number D of bins of a histogram."""
 
+_BRIGHTEST = 100
+"""Maximum of the brightness L in CIELAB."""
+
 _COLOUR_STEP = 10
-"""Width of a bin of the colour axes a and b, in units of OpenCV's 8-bit CIELAB: clothes differ from grey by up to
-40."""
+"""Width of a bin of the colour axes a and b in CIELAB: clothes differ from grey by up to 40."""
+
+_GREY = _BINS / 2 + 0.5
+"""Position of grey on a colour axis, in bins."""
+
+_LEVELS = 32
+"""Number of levels of red, green and blue for which the bin is computed: much finer than the bins."""
 
 _STRIDE = 4
 """Every n-th row and column is counted; a person at 5 m still has some hundred of these pixels."""
@@ -29,9 +40,16 @@ _MIN_PIXELS = 10
 """Minimum number of counted pixels; with fewer the appearance is unknown."""
 
 
-_BRIGHTNESS = np.arange(256) * _BINS // 256
-_CHROMA = np.clip((np.arange(256) - 128) // _COLOUR_STEP + _BINS // 2, 0, _BINS - 1)
-"""Bin of each 8-bit value of the brightness and of a colour axis."""
+@cache
+def _bins_of_colours() -> NDArray[np.int64]:
+    """Return the bin of each colour, from 0 to D - 1, shape (levels of red, of green, of blue)."""
+    level = (torch.arange(_LEVELS) + 0.5) / _LEVELS
+    rgb = torch.stack(torch.meshgrid(level, level, level, indexing="ij"))
+    brightness, a, b = rgb_to_lab(rgb.flatten(1, 2)).unflatten(1, rgb.shape[1:3])
+    # Grey is in the middle of a bin: most clothes have little colour, and noise must not move them to another bin.
+    axes = brightness * _BINS / _BRIGHTEST, a / _COLOUR_STEP + _GREY, b / _COLOUR_STEP + _GREY
+    bins = [axis.floor().clamp(0, _BINS - 1).to(torch.int64) for axis in axes]
+    return np.asarray(((bins[0] * _BINS + bins[1]) * _BINS + bins[2]).numpy())
 
 
 def _smoothing_matrix() -> Tensor:
@@ -57,10 +75,8 @@ def colour_histograms(image: Tensor, masks: Tensor) -> Tensor:
     """
     if len(masks) == 0:
         return torch.empty(0, HISTOGRAM_SIZE, dtype=torch.float32)
-    colours = image.numpy()[:, ::_STRIDE, ::_STRIDE].transpose(1, 2, 0)
-    lab = np.asarray(cv2.cvtColor(np.ascontiguousarray(colours), cv2.COLOR_RGB2LAB), np.uint8)
-    brightness, a, b = (bins.take(lab[..., axis]) for axis, bins in enumerate((_BRIGHTNESS, _CHROMA, _CHROMA)))
-    bins = ((brightness * _BINS + a) * _BINS + b).reshape(-1)
+    red, green, blue = image.numpy()[:, ::_STRIDE, ::_STRIDE] // (256 // _LEVELS)
+    bins = _bins_of_colours()[red, green, blue].reshape(-1)
     inside = masks.numpy()[:, ::_STRIDE, ::_STRIDE].reshape(len(masks), bins.size)
     counts = [np.bincount(bins[mask], minlength=HISTOGRAM_SIZE) for mask in inside]
     counted = torch.from_numpy(np.array(counts, np.float32))
