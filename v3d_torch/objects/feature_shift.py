@@ -17,6 +17,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.objects.mask_ops import look_up
+
 _MIN_FEATURES = 8
 """Minimum number of matched features whose median is known well enough."""
 
@@ -85,7 +87,7 @@ def feature_shifts(pixel: Tensor, residuals: Tensor, masks: Sequence[Tensor]) ->
     if len(masks) == 0 or len(known) < _MIN_FEATURES:
         return [None] * len(masks)
     (u, v), displacement = pixel[known].T, residuals[known].numpy()
-    inside = torch.stack([mask[v, u] for mask in masks]).numpy()
+    inside = look_up(masks, pixel[known]).numpy()
     if (inside.sum(axis=1) < _MIN_FEATURES).all():
         return [None] * len(masks)
     height, width = masks[0].shape

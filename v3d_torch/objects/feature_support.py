@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from v3d_torch.objects.feature_shift import FeatureShift, feature_shifts
+from v3d_torch.objects.mask_ops import look_up
 
 MIN_SUPPORT_RATIO = 0.5
 """Minimum inlier ratio of the features of a supported object, as a fraction of the inlier ratio outside of all objects:
@@ -58,8 +58,7 @@ class FeatureSupport:
         """
         if len(masks) == 0:
             return self.inliers.new_zeros(0)
-        index = self.pixel[:, 1] * masks[0].shape[1] + self.pixel[:, 0]
-        inside = torch.stack([mask.flatten().index_select(0, index) for mask in masks])
+        inside = look_up(masks, self.pixel)
         outside = ~inside.any(dim=0)
         outside_ratio = (self.inliers & outside).sum() / outside.sum().clamp(min=1)
         if int(outside.sum()) < _MIN_OUTSIDE_FEATURES:

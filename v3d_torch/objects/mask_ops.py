@@ -1,4 +1,7 @@
-"""Operations on image masks: nearest-neighbour upsampling and dilation."""
+"""Operations on image masks: values at pixels, subsampling, nearest-neighbour upsampling and dilation.
+
+NumPy copies bytes several times faster here than torch.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +21,27 @@ _MAX_COMPILED_RADIUS = 254
 """Maximum radius of the compiled dilation, pixels: the kernel stores distances up to the radius plus one as uint8."""
 
 
+def look_up(masks: Sequence[Tensor], pixel: Tensor) -> Tensor:
+    """Return the value of each mask at each pixel, bool, shape :math:`(K, N)`.
+
+    Args:
+        masks: K > 0 masks, bool, each of shape :math:`(H, W)`.
+        pixel: Pixels (column, row), int64, shape :math:`(N, 2)`.
+    """
+    index = (pixel[:, 1] * masks[0].shape[1] + pixel[:, 0]).numpy()
+    return torch.from_numpy(np.stack([mask.numpy().take(index) for mask in masks]))
+
+
+def subsample(images: Tensor, step: int) -> Tensor:
+    """Return every n-th row and column of images or masks, shape :math:`(*, h, w)`.
+
+    Args:
+        images: Images, shape :math:`(*, H, W)`.
+        step: Step n between the pixels.
+    """
+    return torch.from_numpy(np.ascontiguousarray(images.numpy()[..., ::step, ::step]))
+
+
 def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Sequence[int]) -> Tensor:
     """Upsample a grid of square cells to pixels.
 
@@ -30,7 +54,7 @@ def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Seq
         Value of the cell at each pixel, dtype of ``cells``, shape :math:`(..., H, W)`.
     """
     height, width = image_size
-    # Repeat along rows first, because that copies less. NumPy is faster here than torch.
+    # Repeat along rows first, because that copies less.
     pixels = cells.repeat(cell_size, axis=-1)[..., :width].repeat(cell_size, axis=-2)[..., :height, :]
     return torch.from_numpy(np.ascontiguousarray(pixels))
 

@@ -77,5 +77,6 @@ def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth:
     mask = silhouette.mask(depth, 0, DEPTH_TOLERANCE, step=step, include_missing=True)
     if track.newest.has_centroid:
         return mask
-    has_points = (depth[0] > 0) & (depth[0] <= max_depth)
-    return mask | (track.mask[::step, ::step] & ~has_points)
+    z = depth[0].numpy()  # NumPy is faster here than torch
+    has_points = (z > 0) & (z <= max_depth)
+    return torch.from_numpy(mask.numpy() | (track.mask.numpy()[::step, ::step] & ~has_points))

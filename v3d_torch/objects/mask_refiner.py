@@ -22,7 +22,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.objects.free_space_check import DepthView
-from v3d_torch.objects.mask_ops import dilate, ellipse, upsample_nearest
+from v3d_torch.objects.mask_ops import dilate, ellipse, subsample, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
@@ -78,6 +78,11 @@ class MaskRefiner:
         return self._newly_occupied.previously_occupied.numpy()
 
     @cached_property
+    def _unknown(self) -> NDArray[np.bool_]:
+        """Every n-th pixel with depth whose surface was not there before."""
+        return ~(self._known | self._view.missing.numpy()[:: self._stride, :: self._stride])
+
+    @cached_property
     def _growable(self) -> NDArray[np.bool_]:
         """Every n-th pixel over which a surface can grow: no edge, and not occupied before the object appeared."""
         smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
@@ -102,21 +107,22 @@ class MaskRefiner:
         agreeing &= dilate(track.mask, config.depth_margin).numpy()
         mask |= agreeing
         mask |= track.cloud_pixels.numpy()
-        mask |= self._unknown_parts(track, mask)
+        self._add_unknown_parts(track, mask)
         return torch.from_numpy(mask)
 
-    def _unknown_parts(self, track: Track, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return the parts of the network's mask beyond the refined mask whose surface was not there before, (H, W).
+    def _add_unknown_parts(self, track: Track, mask: NDArray[np.bool_]) -> None:
+        """Add the parts of the network's mask whose surface was not there before to the refined mask, in place.
 
         A network sometimes draws one mask over two people; the second one is not known background.
         """
         step = self._stride
-        beyond = track.mask.numpy() & ~mask & ~self._view.missing.numpy()
-        cells = beyond[::step, ::step] & ~self._known
+        cells = track.mask.numpy()[::step, ::step] & ~mask[::step, ::step] & self._unknown
         # Contours are coarse: narrow parts along them are background that was not observed before.
         kernel = ellipse(max(_MIN_PART_RADIUS // step, 1))
         parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
-        return beyond & upsample_nearest(parts, step, beyond.shape).numpy()
+        if parts.any():
+            pixels = upsample_nearest(parts, step, mask.shape).numpy()
+            mask |= pixels & track.mask.numpy() & ~self._view.missing.numpy()
 
     def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
         """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (H, W)."""
@@ -124,7 +130,7 @@ class MaskRefiner:
             return track.cloud_pixels & reachable
         step = self._stride
         seeds = track.cloud_pixels.numpy()[::step, ::step]
-        near = dilate(track.mask[::step, ::step].contiguous(), self._config.surface_margin // step).numpy()
+        near = dilate(subsample(track.mask, step), self._config.surface_margin // step).numpy()
         near &= reachable.numpy()[::step, ::step]
         near &= self._growable
         near |= seeds & ~self._concave

@@ -19,6 +19,7 @@ from v3d_torch.objects.association import (
     position_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.mask_ops import subsample
 from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
@@ -134,7 +135,7 @@ def predict_tracks(
         stride: Step between the coarse pixels, pixels.
     """
     projected = silhouettes(predict_clouds(tracks, stamp, T_cw), camera, config.voxel_size)
-    coarse_depth = depth[:, ::stride, ::stride].contiguous()
+    coarse_depth = subsample(depth, stride)
     masks = [
         predict_mask(track, each, coarse_depth, config.max_depth, step=stride)
         for track, each in zip(tracks, projected, strict=True)

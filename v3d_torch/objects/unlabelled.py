@@ -15,7 +15,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
-from v3d_torch.objects.mask_ops import upsample_nearest
+from v3d_torch.objects.mask_ops import subsample, upsample_nearest
 from v3d_torch.objects.motion_evidence import MOVED_FRACTION
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
@@ -47,7 +47,7 @@ def unlabelled_instances(
     step, (height, width) = newly_occupied.stride, depth.shape[-2:]
     appeared = (newly_occupied.appeared == 1).any(dim=0).to(torch.uint8).numpy()
     appeared = cv2.morphologyEx(appeared, cv2.MORPH_OPEN, _OPENING_KERNEL)
-    coarse_masks = instances.masks[:, ::step, ::step].contiguous()
+    coarse_masks = subsample(instances.masks, step)
     explained = _explained_pixels(instances.labels, coarse_masks, torch.from_numpy(appeared > 0))
     appeared[cv2.dilate(explained.to(torch.uint8).numpy(), _RIM_KERNEL) > 0] = 0
     count, region = cv2.connectedComponents(appeared)

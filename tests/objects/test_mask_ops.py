@@ -1,0 +1,24 @@
+"""Operations on masks: values at pixels, subsampling."""
+
+from __future__ import annotations
+
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from v3d_torch.objects.mask_ops import look_up, subsample
+
+
+@given(seed=st.integers(0, 2**16), height=st.integers(1, 12), width=st.integers(1, 12), count=st.integers(0, 20))
+def test_look_up_equals_indexing(seed: int, height: int, width: int, count: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    masks = torch.rand(3, height, width, generator=generator) < 0.5
+    u, v = (torch.randint(size, (count,), generator=generator) for size in (width, height))
+    assert torch.equal(look_up(list(masks), torch.stack([u, v], dim=1)), masks[:, v, u])
+
+
+@given(step=st.integers(1, 5), height=st.integers(1, 12), width=st.integers(1, 12))
+def test_subsample_equals_slicing(step: int, height: int, width: int) -> None:
+    for images in (torch.rand(2, height, width), torch.rand(height, width) < 0.5):
+        found = subsample(images, step)
+        assert torch.equal(found, images[..., ::step, ::step]) and found.is_contiguous()
