@@ -1,22 +1,22 @@
 """ROS 2 node: `LiveSLAM` on the topics of an RGB-D camera; publishes poses, static clouds and a grid for planners.
 
-It has not been tried with an installed ROS: the tests run it with stand-ins for the modules of ROS.
-
 ``python examples/ros2_node.py`` subscribes to ``camera/color/image_raw``, ``camera/color/camera_info`` and
 ``camera/aligned_depth_to_color/image_raw``; other names are given by ``--ros-args -r OLD:=NEW``. It publishes ``/tf``,
 ``/odom``, ``/objects``, ``/cloud``, ``/path`` (see `v3d_torch.export.ros.run_messages`) and, every few seconds,
 ``/map``. The camera driver should not publish transforms of its own (``publish_tf:=false``). Parameters: ``config``,
 name or file of a configuration; ``set``, list of values, ``occupancy.enabled=true`` if not given, as ``/map`` needs.
+It has not been tried with an installed ROS: the tests run it with stand-ins for the modules of ROS.
 """
 
 from __future__ import annotations
 
+import gc
 from queue import SimpleQueue
 from threading import Thread
 
-import message_filters
 import rclpy
 import torch
+from message_filters import ApproximateTimeSynchronizer, Subscriber
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.wait_for_message import wait_for_message
@@ -47,9 +47,8 @@ class SlamNode(Node):
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
         self._messages, self._store = RunMessages(self.camera), get_typestore(Stores.ROS2_HUMBLE)
         self._count, self._topics = 0, {}
-        qos = {"qos_profile": qos_profile_sensor_data}
-        subscribers = [message_filters.Subscriber(self, Image, topic, **qos) for topic in (COLOUR, DEPTH)]
-        self._images = message_filters.ApproximateTimeSynchronizer(subscribers, queue_size=5, slop=0.02)
+        subscribers = [Subscriber(self, Image, name, qos_profile=qos_profile_sensor_data) for name in (COLOUR, DEPTH)]
+        self._images = ApproximateTimeSynchronizer(subscribers, queue_size=5, slop=0.02)
         self._images.registerCallback(self._add_frame)
 
     def receive(self) -> None:
@@ -69,11 +68,11 @@ class SlamNode(Node):
                 self._publish(topic, message)
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
-        times = [image.header.stamp.sec + 1e-9 * image.header.stamp.nanosec for image in (colour, depth)]
-        stamp = times[0] + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
+        time, depth_time = (each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec for each in (colour, depth))
+        stamp = time + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
         try:
             images = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
-            frame = v3d.RGBDFrame.from_arrays(self._count, stamp, *images, self.camera, depth_delay=times[1] - times[0])
+            frame = v3d.RGBDFrame.from_arrays(self._count, stamp, *images, self.camera, depth_delay=depth_time - time)
         except v3d.InputError as error:
             self.get_logger().warning(f"a frame is skipped: {error}")
         else:
@@ -88,6 +87,7 @@ class SlamNode(Node):
 
 def main() -> None:
     """Run until ROS is shut down."""
+    gc.freeze()  # later searches for garbage leave out the objects of the imports, which would take 0.2 s
     rclpy.init()
     torch.set_num_threads(1)  # more threads mostly wait for each other
     node = SlamNode()

@@ -17,12 +17,14 @@ from systems.base import System
 from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.errors import V3DError
+from v3d_torch.runtime.imports import quick_imports
 
 
 def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> System:
     """Load a system and only its own libraries."""
     if name in OURS:
-        from systems.ours import Ours
+        with quick_imports():  # as v3d_torch/cli/run.py
+            from systems.ours import Ours
 
         return Ours(sequence, name, seed)
     if name == "pyorbslam3":
