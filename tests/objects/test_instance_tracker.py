@@ -405,6 +405,16 @@ def test_missed_furniture_that_has_moved_is_predicted() -> None:
     assert predicted is track and track.missed and bool(track.mask.any())
 
 
+def test_missed_furniture_that_was_once_detected_as_a_person_is_predicted() -> None:
+    track_boards = BoardTracker()
+    track_boards(Board(0.0, label=PERSON))
+    track_thrice(track_boards, Board(0.0, label=CHAIR))
+    (track,) = track_boards.tracker.tracks
+    assert track.label == CHAIR
+    (predicted,) = track_boards(Board(0.0, label=CHAIR, detected=False))
+    assert predicted is track and track.missed and bool(track.mask.any())
+
+
 def test_resting_furniture_is_lost_after_the_maximum_time_and_keeps_its_id() -> None:
     track_boards = BoardTracker()
     for _ in range(30):

@@ -157,8 +157,11 @@ class Track:
 
     @property
     def may_move(self) -> bool:
-        """True if the object can move by itself or has moved; false for furniture that was always at rest."""
-        return self.label not in RIGID or self.last_dynamic > -torch.inf
+        """True if the object may move by itself or has moved; false for furniture that was always at rest.
+
+        A person at the border of the image is often detected as furniture.
+        """
+        return self.label not in RIGID or self.may_be_living or self.last_dynamic > -torch.inf
 
     @property
     def may_be_living(self) -> bool:
