@@ -26,6 +26,7 @@ from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter, make_segmenter
@@ -233,6 +234,22 @@ def test_previous_frame_is_refined_before_a_frame_is_tracked(demo: RGBDSequence)
     for index in range(3):
         slam(demo[index])
     assert calls == ["nothing", "track", "refine 0", "track", "refine 1", "track"]
+
+
+def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(demo: RGBDSequence) -> None:
+    slam, delay = V3DSLAM(demo.camera, NoSegmentation()), 0.012
+    motions: list[CameraMotion] = []
+    views: list[DepthView] = []
+    slam.register_stage_hook("odometry", lambda name, args, motion: motions.append(motion))
+    slam.register_stage_hook("free_space_check", lambda name, args, result: views.append(args[0]))
+    for index in range(3):
+        before = slam.poses.T_cw
+        slam(replace(demo[index], depth_delay=delay))
+    T_dc = se3_exp(motions[-1].velocity * delay)
+    assert float((T_dc - torch.eye(4)).abs().max()) > 1e-4  # the camera moves
+    torch.testing.assert_close(views[-1].T_cw, T_dc @ motions[-1].T_cp @ before)
+    stored = slam.free_space_check.state_dict()["views"][-1]
+    torch.testing.assert_close(stored.T_cw, T_dc @ slam.poses.T_cw)
 
 
 def test_views_before_a_loss_are_compared_only_when_the_camera_is_found(demo: RGBDSequence) -> None:

@@ -16,7 +16,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.frame_result import FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, orthonormalise
+from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_ids import compact_landmarks
 from v3d_torch.mapping.mapper import Mapper
@@ -223,8 +223,10 @@ class V3DSLAM(FramePreprocessor):
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
-            T_cw, was_lost = self._compose_pose(motion), self.poses.status is TrackingStatus.LOST
-            view = self.free_space_check.make_view(frame.stamp, depth, T_cw, is_motion_measured=motion.is_measured)
+            was_lost = self.poses.status is TrackingStatus.LOST
+            T_dc = se3_exp(motion.velocity * frame.depth_delay)  # from the time of the colour image to that of depth
+            T_dw = T_dc @ self._compose_pose(motion)
+            view = self.free_space_check.make_view(frame.stamp, depth, T_dw, is_motion_measured=motion.is_measured)
             newly_occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
         segmentation = self._wait_for_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
@@ -251,7 +253,7 @@ class V3DSLAM(FramePreprocessor):
             keyframe = self._extend_map(frame, static, pose, motion)
             has_objects = self._proposes_objects or not isinstance(innermost_segmenter(self.segment), NoSegmentation)
             if has_objects and pose.status is not TrackingStatus.LOST:
-                self.free_space_check.add_view(view, self.poses.T_cw)
+                self.free_space_check.add_view(view, T_dc @ self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, velocity of the camera

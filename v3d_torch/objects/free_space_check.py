@@ -76,9 +76,9 @@ class DepthView:
     Attributes:
         stamp: Timestamp, seconds.
         depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-        misalignment: Largest offset of the depth from the colour image that the pose refers to, pixels. It arises when
-            the camera turns between both exposures.
+        T_cw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
+        misalignment: Largest offset of the depth of a pixel from that pose, pixels. It arises when the camera turns
+            while the image is read.
         is_motion_measured: True if the motion of the camera since the previous frame is measured; otherwise the pose is
             a guess.
     """
