@@ -146,8 +146,9 @@ class FreeSpaceConfig(Section):
     min_tolerance: float = Field(0.04, ge=0.001)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
     depth_sync_error: float = Field(0.015, ge=0, le=1)
-    """Maximum time between the stamp of a depth image and the exposure of a pixel, seconds: half of the time in which a
-    Kinect reads an image. If the camera turns, depth is shifted by the pixels that it turns in this time."""
+    """Maximum time between the stamp of a depth image and the exposure of a pixel, seconds: about half of the interval
+    between two frames at 30 Hz, within which an image is read. If the camera turns, depth is shifted by the pixels that
+    it turns in this time."""
     min_depth: float = Field(0.3, gt=0)
     """Minimum depth of points that are checked, metres: below the range of the cameras."""
     min_points: int = Field(30, gt=0)

@@ -86,11 +86,11 @@ def feature_shifts(pixel: Tensor, residuals: Tensor, masks: Sequence[Tensor]) ->
     known = torch.nonzero(residuals.isfinite().all(dim=1))[:, 0]
     if len(masks) == 0 or len(known) < _MIN_FEATURES:
         return [None] * len(masks)
-    (u, v), displacement = pixel[known].T, residuals[known].numpy()
-    inside = look_up(masks, pixel[known]).numpy()
+    pixel, displacement = pixel[known], residuals[known].numpy()
+    inside = look_up(masks, pixel).numpy()
     if (inside.sum(axis=1) < _MIN_FEATURES).all():
         return [None] * len(masks)
-    height, width = masks[0].shape
+    (u, v), (height, width) = pixel.T, masks[0].shape
     cell = (v * _GRID[0] // height * _GRID[1] + u * _GRID[1] // width).numpy()
     outside = ~inside.any(axis=0)
     elsewhere = _displacement_of_cells(displacement[outside], cell[outside])

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
-from v3d_torch.objects.mask_ops import subsample
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,7 @@ class NewlyOccupied:
         rows = len(self.appeared)
         if not masks:
             return self.appeared.new_zeros(0, rows)
-        inside = pack_masks(torch.stack([subsample(mask, self.stride) for mask in masks]))
+        inside = torch.stack([pack_masks(mask, self.stride) for mask in masks])
         indicators = pack_masks(torch.cat([self.appeared == 1, ~self.appeared.isnan()]))
         counts = count_common_pixels(inside, indicators).to(torch.float64)
         new, known = counts[:, :rows], counts[:, rows:]
