@@ -14,7 +14,13 @@ from v3d_torch.evaluation.tables import markdown_row
 
 T = TypeVar("T")
 
-SYSTEMS = {"full": "full", "baseline": "baseline", "pyorbslam3": "ORB-SLAM3 (PyPI)", "open3d": "Open3D odometry"}
+SYSTEMS = {
+    "full": "full",
+    "realtime": "realtime",
+    "baseline": "baseline",
+    "pyorbslam3": "ORB-SLAM3 (PyPI)",
+    "open3d": "Open3D odometry",
+}
 """Names of systems in tables; other systems keep their own names."""
 
 COMMANDS = {
