@@ -115,6 +115,16 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             ),
             pivot_table("stage", "ms"),
         ),
+        Part(
+            "speed_float32",
+            (
+                "The same on a processor without 8-bit vector instructions, where the network runs in 32 bits. It is"
+                " slower in everything else too: only the ratios can be compared with those above."
+            ),
+            speed_table,
+            key="system",
+        ),
+        Part("stages_float32", "Time of each stage on that processor, ms per frame.", pivot_table("stage", "ms")),
     ),
     "Growth": (
         Part(

@@ -23,6 +23,7 @@ from systems.process import Measured, SystemRunError, measure
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
+from v3d_torch.segmentation.quantise import has_int8_instructions
 
 REFERENCE = "pyorbslam3"
 SYSTEMS = (*OURS, *PEERS)
@@ -117,6 +118,11 @@ def stage_table(turns: Sequence[Turn]) -> Iterator[str]:
         yield markdown_row([stage, *(times.get((name, stage), "-") for name in OURS)])
 
 
+def file_of(name: str) -> str:
+    """Return the file of a measurement: processors without 8-bit vector instructions have files of their own."""
+    return name if has_int8_instructions() else f"{name}_float32"
+
+
 def failures(turns: Sequence[Turn]) -> Iterator[str]:
     """Yield a line per failed run with its error message."""
     for number, turn in enumerate(turns, start=1):
@@ -156,8 +162,8 @@ def main() -> None:
         cells = {"sequence": Path(sequence).name}
         speed_rows += [cells | measured for measured in system_rows(turns)]
         stage_rows += [cells | measured for measured in stage_times(turns) if measured["system"] == OURS[0]]
-    measurements = {"speed": Measurement(heading, speed_rows), "stages": Measurement(heading, stage_rows)}
-    publish(lines, options, parser, measurements)
+    rows = {"speed": speed_rows, "stages": stage_rows}
+    publish(lines, options, parser, {file_of(name): Measurement(heading, each) for name, each in rows.items()})
 
 
 if __name__ == "__main__":

@@ -39,7 +39,9 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "primitives": ("primitive", "size", "threads", "implementation"),
     "segmentation": ("sequence", "network"),
     "speed": ("sequence", "system"),
+    "speed_float32": ("sequence", "system"),
     "stages": ("sequence", "stage"),
+    "stages_float32": ("sequence", "stage"),
     "tracks": ("sequence", "tracker"),
     "voting_thresholds": ("sequence", "rule", "numbers"),
 }
