@@ -474,6 +474,18 @@ def test_part_of_a_tracked_object_is_not_a_second_object() -> None:
     assert [track.id for track in tracks] == [1]
 
 
+def test_one_mask_over_two_people_does_not_hide_the_second_one() -> None:
+    """The cloud of the mask is that of the larger person, who is nearer; the other one is missed, not lost."""
+    track_boards, boards = BoardTracker(), [Board(-0.3, 2.0), Board(0.4, 3.0, height=1.0)]
+    track_thrice(track_boards, *boards)
+    depth, instances = render(boards)
+    both = Instances.from_masks(instances.masks.any(dim=0, keepdim=True), instances.labels[:1])
+    tracks = track_boards.track(depth, both, 0.1)
+    assert [(track.id, track.missed) for track in tracks] == [(1, False), (2, True)]
+    assert torch.equal(tracks[1].mask, instances.masks[1])
+    assert [track.id for track in track_boards.track(depth, instances, 0.2)] == [1, 2]
+
+
 def test_predicted_mask_follows_the_camera() -> None:
     track_boards = BoardTracker()
     track_thrice(track_boards, Board(0.0))

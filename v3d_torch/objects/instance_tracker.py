@@ -321,7 +321,10 @@ class InstanceTracker(torch.nn.Module):
         self.lost = [track for track in candidates if stamp - track.newest.stamp <= remembered]
 
     def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
-        """Check for each track whether its predicted mask belongs to a detected track of the same class.
+        """Check for each track whether its predicted mask shows the surface of a detected track of the same class.
+
+        The mask of the other track alone does not count, because a network sometimes draws one mask over two people;
+        its cloud is that of one of them.
 
         Args:
             tracks: T tracks.
@@ -331,7 +334,8 @@ class InstanceTracker(torch.nn.Module):
         located = [track for track in updated if track.newest.has_centroid]
         if not located or not tracks:
             return [False] * len(tracks)
-        common = count_common_pixels(coarse_masks, torch.stack([other.coarse_mask for other in located]))
+        surfaces = pack_masks(torch.stack([other.cloud_pixels for other in located]), self._stride)
+        common = count_common_pixels(coarse_masks, surfaces)
         is_over = common > self._config.min_overlap * count_pixels(coarse_masks)[:, None]
         same_class = torch.tensor([[track.label == other.label for other in located] for track in tracks])
         covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
