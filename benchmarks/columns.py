@@ -69,6 +69,13 @@ CALIBRATION = {
     "result": "result",
 }
 
+DEGRADED = {
+    "sequence": "sequence",
+    "degradation": "degradation",
+    "ours": "v3d_torch, ATE, m",
+    "peer": "ORB-SLAM3 (PyPI), ATE, m",
+}
+
 HELD_OUT = {
     "sequence": "sequence",
     "change": "wrong in the camera file",

@@ -49,6 +49,7 @@ def publish_rows(
     headings: Mapping[str, str],
     measure: Callable[[str], Iterable[Row]],
     about: Iterable[str] = (),
+    peers: tuple[str, ...] = (),
 ) -> None:
     """Measure each sequence of ``--seqs`` and publish the rows as one table.
 
@@ -59,8 +60,9 @@ def publish_rows(
         headings: Headings of the columns by cell.
         measure: Returns the rows of a sequence, given as `load_sequence` takes it.
         about: Lines below the table.
+        peers: Further packages whose versions to record.
     """
-    heading = make_heading()
+    heading = make_heading(peers)
     try:
         rows = [row for sequence in options.seqs for row in measure(locate_sequence(sequence, options.data_root))]
     except V3DError as error:

@@ -95,6 +95,16 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             remarks=accuracy_remarks,
         ),
     ),
+    "Degraded images": (
+        Part(
+            "degraded",
+            (
+                "ATE if each sequence has fewer frames, less light, blur, noisier depth or a lower resolution. Both"
+                " systems have their defaults, and read the same files."
+            ),
+            flat_table(columns.DEGRADED),
+        ),
+    ),
     "Speed": (
         Part(
             "speed",

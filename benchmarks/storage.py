@@ -23,6 +23,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "accuracy": ("sequence", "system"),
     "calibration": ("sequence", "change", "parameter"),
     "consistency": ("sequence", "configuration"),
+    "degraded": ("sequence", "degradation"),
     "design_choices": ("choice", "sequence"),
     "feature_uncertainty": ("sequence",),
     "growth": ("sequence", "frames"),

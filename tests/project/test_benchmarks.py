@@ -21,6 +21,7 @@ from v3d_torch.types import Instances, RGBDFrame
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 
 import accuracy
+import degraded
 import descriptions
 import growth
 import segmentation
@@ -51,6 +52,29 @@ def test_script_can_be_imported(name: str) -> None:
         if error.name is None or error.name.partition(".")[0] in {"v3d_torch", *SCRIPTS}:
             raise
         pytest.skip(f"{error.name} is not installed")
+
+
+class TestDegraded:
+    @pytest.mark.parametrize("name", degraded.DEGRADATIONS)
+    def test_degraded_sequence_can_be_read_with_its_camera_and_ground_truth(
+        self, name: str, moment: Path, tmp_path: Path
+    ) -> None:
+        sequence, degradation = load_sequence(str(moment)), degraded.DEGRADATIONS[name]
+        degraded.write(sequence, degradation, tmp_path / "out")
+        written = load_sequence(str(tmp_path / "out"))
+        assert torch.equal(written.stamps, sequence.stamps[:: degradation.step])
+        assert written.groundtruth is not None
+        frame, original = written[0], sequence[0]
+        assert frame.image.shape[1:] == (written.camera.height, written.camera.width)
+        same = torch.equal(frame.image, original.image), torch.equal(frame.depth, original.depth)
+        assert all(same) == (name in {"none", "every second frame"})
+
+    def test_point_has_half_the_pixel_coordinates_at_half_the_resolution(self) -> None:
+        """Two pixels are combined, so that the corners of the image are at -0.5 before and after."""
+        camera = PinholeCamera(500.0, 510.0, 310.0, 250.0)
+        point = torch.tensor([[0.1, -0.2, 1.5]], dtype=torch.float64)
+        whole, combined = camera.project(point), degraded.half(camera).project(point)
+        assert torch.allclose((whole + 0.5) / 2, combined + 0.5)
 
 
 class TestReplay:

@@ -195,7 +195,7 @@ def can_read(tensor: Tensor) -> bool:
     compiler traces, have no values; those in forward-mode differentiation count as such.
     """
     is_plain = type(tensor) in (Tensor, torch.nn.Parameter)
-    return not _is_traced() and is_plain and tensor.device.type == "cpu"
+    return not _is_traced() and is_plain and tensor.is_cpu
 
 
 def is_all_true(mask: Tensor) -> bool:
@@ -223,7 +223,7 @@ def _is_plain(argument: object) -> bool:
     """Check whether an argument is not a tensor, or a tensor on the CPU without gradients."""
     if not isinstance(argument, Tensor):
         return True
-    return type(argument) is Tensor and argument.device.type == "cpu" and not argument.requires_grad
+    return type(argument) is Tensor and argument.is_cpu and not argument.requires_grad
 
 
 @cache
