@@ -295,7 +295,7 @@ class V3DSLAM(FramePreprocessor):
             stamp: Time in the clock of the frames, seconds; at most 10 s before the last frame, or later than it.
 
         Raises:
-            InputError: If the time is earlier, or no frame has been tracked.
+            InputError: If the time is earlier or not finite, or no frame has been tracked.
         """
         return self.states.at(stamp)
 

@@ -84,6 +84,17 @@ def test_lost_poses_do_not_indicate_depth_unit() -> None:
         evaluate(groundtruth, estimate, is_located=is_located[1:])
 
 
+@pytest.mark.parametrize("name", ["ground truth", "estimate"])
+def test_pose_that_is_not_finite_is_an_error(name: str) -> None:
+    groundtruth = random_walk(60, seed=13)
+    broken = groundtruth.T_wc.clone()
+    broken[7, 0, 3] = torch.nan
+    pair = {"ground truth": groundtruth.T_wc, "estimate": groundtruth.T_wc} | {name: broken}
+    trajectories = [Trajectory(groundtruth.stamps, pair[each]) for each in ("ground truth", "estimate")]
+    with pytest.raises(InputError, match=f"^the {name} has a pose that is not finite; remove such poses$"):
+        evaluate(*trajectories)
+
+
 def test_placeholder_orientations_give_no_rpe() -> None:
     groundtruth = random_walk(60, seed=13)
     T_wc = groundtruth.T_wc.clone()

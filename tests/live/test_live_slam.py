@@ -233,6 +233,18 @@ def test_leaving_the_loop_stops_all_threads() -> None:
     assert {thread.name for thread in set(threading.enumerate()) - before} <= {"back-end_0"}
 
 
+def test_rejected_frames_are_counted_over_several_loops() -> None:
+    parts = [[Wall()[index] for index in indices] for indices in ((0, 0, 1), (2, 3))]
+
+    class Resumed:
+        def __iter__(self) -> Iterator[RGBDFrame]:
+            return iter(parts.pop(0))
+
+    live = LiveSLAM(Resumed(), V3DSLAM(CAMERA, square))
+    assert list(live) and live.rejected == 1
+    assert list(live) and live.rejected == 1
+
+
 def test_configuration_without_threads_is_rejected() -> None:
     with pytest.raises(ConfigError, match="prefetch=false: a live camera needs threads; remove --serial"):
         LiveSLAM(iter(()), V3DSLAM(CAMERA, square, Config(prefetch=False)))

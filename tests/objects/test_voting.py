@@ -13,6 +13,7 @@ from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.objects.voting import HoughVoting, hough_vote
 
 Objects = dict[str, tuple[float, float, float]]
@@ -124,6 +125,14 @@ def test_soft_vote_converges_to_hard_vote() -> None:
     at_threshold = hough_vote(previous, current, all_present, float(hard.change[0, 1]), 2, temperature=0.1)
     assert at_threshold.pair[0, 1] == pytest.approx(0.5)
     assert not at_threshold.pair.diagonal().any()  # no object votes for itself
+
+
+@pytest.mark.parametrize("temperature", [0, -0.1, math.nan])
+def test_temperature_that_is_not_positive_is_an_error(temperature: float) -> None:
+    """A change that equals the threshold would be 0 / 0."""
+    previous, current = scene(3, [1], by=0.5)
+    with pytest.raises(ConfigError, match=r"^hough_vote: temperature is .*; give a number above 0, or None$"):
+        hough_vote(previous, current, torch.ones(3, dtype=torch.bool), 0.05, 2, temperature=temperature)
 
 
 def test_gradients_are_correct_and_finite_with_absent_objects() -> None:

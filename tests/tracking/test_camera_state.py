@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import replace
 
 import pytest
@@ -172,6 +173,9 @@ def test_times_that_are_not_kept_are_input_errors() -> None:
     with pytest.raises(InputError, match="no frame has been tracked; track a frame first"):
         StateHistory().at(1.0)
     states = history(*(n / 10 for n in range(200)))
+    for stamp in (math.nan, math.inf):
+        with pytest.raises(InputError, match=f"^no state at {stamp} s: the time is not finite$"):
+            states.at(stamp)
     with pytest.raises(InputError, match=r"only states of the last 10 s are stored, since 9\.800000 s"):
         states.at(9.0)
 

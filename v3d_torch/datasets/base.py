@@ -48,7 +48,7 @@ class SkipsFrames(Protocol):
 
     @property
     def skipped(self) -> int:
-        """Number of frames that were skipped so far."""
+        """Number of frames that were skipped since the iteration over the stream began."""
 
 
 @runtime_checkable

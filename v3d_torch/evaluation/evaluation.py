@@ -89,8 +89,8 @@ def evaluate(
             None if this is not known. The other poses count for the errors, but do not indicate the scale of depth.
 
     Raises:
-        InputError: If fewer than three poses can be associated, if an argument is not a trajectory, or if
-            ``is_located`` is not a mask of the poses.
+        InputError: If fewer than three poses can be associated, if an argument is not a trajectory, if an associated
+            pose is not finite, or if ``is_located`` is not a mask of the poses.
     """
     for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
         if not isinstance(value, Trajectory):
@@ -109,6 +109,9 @@ def evaluate(
             f" {MIN_PAIRS} are needed; {_suggest(groundtruth, estimate)}"
         )
     T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
+    for name, poses in (("ground truth", T_gc), ("estimate", T_ec)):
+        if not bool(poses.isfinite().all()):
+            raise InputError(f"the {name} has a pose that is not finite; remove such poses")
     oriented = has_orientations(groundtruth)
     alignment = align(T_gc, T_ec, oriented=oriented)
     notes = []

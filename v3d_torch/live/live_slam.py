@@ -81,21 +81,25 @@ class LiveSLAM:
         self._source = source
         self._clock = clock
         self._capture: FrameCapture | None = None
+        self._rejected_before = 0  # by the captures before this one
         self._measured_at: float | None = None  # time at which the motion to the newest frame was measured
 
     @property
     def rejected(self) -> int:
         """Number of frames so far that were not later than all frames before: late, duplicate or out of order."""
-        return 0 if self._capture is None else self._capture.rejected
+        return self._rejected_before + (0 if self._capture is None else self._capture.rejected)
 
     def __iter__(self) -> Generator[LiveResult, None, None]:
         """Start the source and yield the result of each tracked frame.
+
+        The frames that are being captured and preprocessed when the loop is left are discarded, and not counted.
 
         Raises:
             InputError: If the source ends with an error, or a frame is not valid.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
         _warm_up(self.slam)
+        self._rejected_before = self.rejected
         self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
         preprocessor = LivePreprocessor(capture.frames, self.slam)
         hook = self.slam.register_stage_hook("odometry", self._record_motion)

@@ -9,6 +9,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import VotingConfig
+from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 
@@ -66,8 +67,11 @@ def hough_vote(
 
     Raises:
         InputError: If ``present`` is not bool.
+        ConfigError: If ``temperature`` is a number that is not positive.
     """
     check_masks(present=present)
+    if isinstance(temperature, (int, float)) and not temperature > 0:  # also if it is NaN
+        raise ConfigError(f"hough_vote: temperature is {temperature}; give a number above 0, or None")
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
     KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])

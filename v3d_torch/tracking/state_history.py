@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
@@ -60,9 +61,11 @@ class StateHistory:
             stamp: Time, seconds.
 
         Raises:
-            InputError: If the time is before the first stored state, or if no frame has been tracked.
+            InputError: If the time is not finite or before the first stored state, or if no frame has been tracked.
         """
         states = self._states
+        if not math.isfinite(stamp):
+            raise InputError(f"no state at {stamp} s: the time is not finite")
         if not states:
             raise InputError(f"no state at {stamp:.6f} s: no frame has been tracked; track a frame first")
         if stamp < states[0].stamp:
