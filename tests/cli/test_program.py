@@ -1,4 +1,4 @@
-"""Start of the program: Ctrl-C while modules are imported."""
+"""Start of the program: Ctrl-C or SIGTERM while modules are imported."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ import pytest
 from helpers.commands import assert_error_line
 
 INTERRUPT = """
+import os
+import signal
 import sys
 
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
         if name == {module!r}:
-            raise KeyboardInterrupt
+            os.kill(os.getpid(), signal.{number})
 
 sys.meta_path.insert(0, Interrupt())
 """
-"""Code that raises the exception of Ctrl-C when a module is imported."""
+"""Code that sends a signal when a module is imported."""
 
 PROGRAM = "from v3d_torch.__main__ import main; main()"
 
@@ -30,9 +32,13 @@ MODULE = "import runpy; runpy.run_module('v3d_torch.run', run_name='__main__', a
     [(PROGRAM, ["run", "--seq", "demo"]), (PROGRAM, ["record", "--out", "out"]), (MODULE, ["--seq", "demo"])],
     ids=["run", "record", "module run"],
 )
-@pytest.mark.parametrize("module", ["typer", "rich.console", "torch"])
-def test_ctrl_c_during_an_import_is_reported_as_later(module: str, start: str, arguments: list[str]) -> None:
-    code = INTERRUPT.format(module=module) + start
+@pytest.mark.parametrize(
+    ("module", "number"), [("typer", "SIGINT"), ("rich.console", "SIGTERM"), ("torch", "SIGINT"), ("torch", "SIGTERM")]
+)
+def test_signal_during_an_import_is_reported_as_later(
+    module: str, number: str, start: str, arguments: list[str]
+) -> None:
+    code = INTERRUPT.format(module=module, number=number) + start
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )

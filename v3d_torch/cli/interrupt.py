@@ -1,10 +1,24 @@
-"""Report of Ctrl-C; it imports nothing of the package, so that it is ready before the imports that take time."""
+"""Report of Ctrl-C and SIGTERM; it imports nothing of the package, so that it is ready before slow imports."""
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+
+
+def interrupt_on_termination() -> None:
+    """Make SIGTERM, with which a system or a container ends its processes, raise the exception of Ctrl-C.
+
+    A command then removes what it has half written, and reports the interruption.
+    """
+    signal.signal(signal.SIGTERM, _raise_interrupt)
+
+
+def _raise_interrupt(signum: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
 
 
 @contextmanager

@@ -1,8 +1,8 @@
-"""Start of the program, without imports that take time, so that Ctrl-C is reported from the first moment."""
+"""Start of the program, without slow imports, so that Ctrl-C and SIGTERM are reported from the first moment."""
 
 from __future__ import annotations
 
-from v3d_torch.cli.interrupt import exit_on_interrupt
+from v3d_torch.cli.interrupt import exit_on_interrupt, interrupt_on_termination
 
 _INTERRUPTED = 130
 """Exit code of Typer after Ctrl-C, without a message."""
@@ -11,6 +11,7 @@ _INTERRUPTED = 130
 def main() -> None:
     """Import the commands, and call that of the command line."""
     with exit_on_interrupt():
+        interrupt_on_termination()
         from v3d_torch.cli.commands import app
 
         try:
