@@ -16,11 +16,15 @@ import sys
 class Interrupt:
     def find_spec(self, name, path=None, target=None):
         if name == {module!r}:
-            os.kill(os.getpid(), signal.{number})
+            {interrupt}
 
 sys.meta_path.insert(0, Interrupt())
 """
-"""Code that sends a signal when a module is imported."""
+"""Code that interrupts the process when a module is imported."""
+
+CTRL_C = "raise KeyboardInterrupt"  # not a signal, which a process in the background ignores
+
+SIGTERM = "os.kill(os.getpid(), signal.SIGTERM)"
 
 PROGRAM = "from v3d_torch.__main__ import main; main()"
 
@@ -33,12 +37,14 @@ MODULE = "import runpy; runpy.run_module('v3d_torch.run', run_name='__main__', a
     ids=["run", "record", "module run"],
 )
 @pytest.mark.parametrize(
-    ("module", "number"), [("typer", "SIGINT"), ("rich.console", "SIGTERM"), ("torch", "SIGINT"), ("torch", "SIGTERM")]
+    ("module", "interrupt"),
+    [("typer", CTRL_C), ("rich.console", CTRL_C), ("torch", CTRL_C), ("typer", SIGTERM), ("torch", SIGTERM)],
+    ids=["typer", "rich", "torch", "typer, SIGTERM", "torch, SIGTERM"],
 )
-def test_signal_during_an_import_is_reported_as_later(
-    module: str, number: str, start: str, arguments: list[str]
+def test_interruption_during_an_import_is_reported_as_later(
+    module: str, interrupt: str, start: str, arguments: list[str]
 ) -> None:
-    code = INTERRUPT.format(module=module, number=number) + start
+    code = INTERRUPT.format(module=module, interrupt=interrupt) + start
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False
     )
