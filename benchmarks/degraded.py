@@ -13,11 +13,12 @@ from tempfile import TemporaryDirectory
 
 import columns
 import torch
-from accuracy import Outcome, ate_cell, run, run_peer
+from accuracy import accuracy_rows, run, run_peer
 from command import add_sequences_option, add_vocabulary_option, make_parser, publish_rows
 from kornia.filters import gaussian_blur2d
 from sequences import trained_vocabulary
 from storage import Row
+from tables import accuracy_cell
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -123,13 +124,8 @@ def measure(source: str, seeds: int, data_root: Path, vocabulary: Path) -> Itera
             write(sequence, degradation, degraded)
             ours = [run(str(degraded), "full", seed, data_root) for seed in range(seeds)]
             peer = [run_peer(str(degraded), PEER, turn, data_root, vocabulary) for turn in range(seeds)]
-        yield {"sequence": Path(source).name, "degradation": name, "ours": cell(ours), "peer": cell(peer)}
-
-
-def cell(runs: list[Outcome]) -> str:
-    """Return the ATE of the runs, and the lowest coverage if a frame has no pose."""
-    coverage = min((run.metrics["coverage"] for run in runs if run.metrics), default=1.0)
-    return ate_cell(runs) + (f" ({coverage:.0%} of the frames)" if coverage < 0.995 else "")
+        cells = {row["system"]: accuracy_cell(row) for row in accuracy_rows([*ours, *peer])}
+        yield {"sequence": Path(source).name, "degradation": name, "ours": cells["full"], "peer": cells[PEER]}
 
 
 def main() -> None:

@@ -6,7 +6,6 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType
 
 
 def interrupt_on_termination() -> None:
@@ -14,11 +13,7 @@ def interrupt_on_termination() -> None:
 
     A command then removes what it has half written, and reports the interruption.
     """
-    signal.signal(signal.SIGTERM, _raise_interrupt)
-
-
-def _raise_interrupt(signum: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 @contextmanager
