@@ -215,6 +215,21 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
     assert_same_results(out, whole_run)
 
 
+def test_message_of_ctrl_c_while_results_are_written_names_the_way_to_resume(
+    sequence: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(results, "write_ply", interrupt)
+        done = call(*run_arguments(sequence, out, "--save-masks", *CHECKPOINT_EVERY_FRAME))
+    assert_error_line(done, f"{out}: interrupted before the results were written; resume with --resume {out}")
+    assert call("--resume", out).exit_code == 0
+    assert_same_results(out, whole_run)
+
+
 def test_errors_of_results_and_recording_are_both_reported(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from helpers.trajectories import assert_statistics, noisy, random_walk
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.rpe import motion_errors, pairs_apart, relative_errors, relative_pose_error, rpe
@@ -148,3 +151,12 @@ def test_rpe_has_gradients_that_are_finite_for_a_perfect_estimate() -> None:
     perfect = truth.T_wc.clone().requires_grad_()
     sum(rpe(truth.T_wc, perfect, truth.stamps, delta=2 / 30)).backward()
     assert perfect.grad is not None and perfect.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("delta", [0.0, -1.0, math.nan])
+def test_time_between_poses_that_is_not_positive_is_an_error(delta: float) -> None:
+    truth = random_walk(8, seed=41)
+    with pytest.raises(ConfigError, match=r"delta is .*; give a number above 0"):
+        rpe(truth.T_wc, truth.T_wc, truth.stamps, delta=delta)
+    with pytest.raises(ConfigError, match=r"delta is .*; give a number above 0"):
+        evaluate(truth, truth, rpe_delta=delta)

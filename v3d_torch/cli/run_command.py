@@ -206,6 +206,10 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         )
     except OutputError as error:
         raise OutputError(f"{error}{_way_to_resume(folder)}") from error
+    except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
+        raise InputError(
+            f"{folder}: interrupted before the results were written{_way_to_resume(folder)}"
+        ) from interrupt
     _print_summary(request, display, folder, pipeline, evaluation, console)
 
 

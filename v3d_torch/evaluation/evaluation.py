@@ -91,6 +91,7 @@ def evaluate(
     Raises:
         InputError: If fewer than three poses can be associated, if an argument is not a trajectory, if an associated
             pose is not finite, or if ``is_located`` is not a mask of the poses.
+        ConfigError: If ``rpe_delta`` is not positive.
     """
     for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
         if not isinstance(value, Trajectory):

@@ -11,7 +11,7 @@ from torch import Tensor
 from v3d_torch.evaluation.association import Matches
 from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.runtime.batches import common_batch, mask_or_all
@@ -77,6 +77,7 @@ def rpe(
 
     Raises:
         InputError: If ``valid`` is not bool.
+        ConfigError: If ``delta`` is not positive.
     """
     check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
@@ -110,6 +111,9 @@ def relative_pose_error(
 
     Returns:
         The RPE; None if no two associated poses are ``delta`` apart.
+
+    Raises:
+        ConfigError: If ``delta`` is not positive.
     """
     errors = motion_errors(groundtruth, estimate, matches, delta)
     pairs = len(errors.first)
@@ -160,7 +164,11 @@ def find_later(stamps: Tensor, count: Tensor, delta: float) -> tuple[Tensor, Ten
 
     Returns:
         Index of the later pose, int64, and a mask of the poses that have one, bool, both of shape :math:`(..., N)`.
+
+    Raises:
+        ConfigError: If ``delta`` is not positive.
     """
+    check_positive(delta=delta)
     last = (count - 1).clamp(min=0)[..., None]
     later = stamps + delta
     after = torch.minimum(torch.searchsorted(stamps.contiguous(), later.contiguous()), last)
