@@ -26,7 +26,7 @@ from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter, make_segmenter
@@ -236,15 +236,21 @@ def test_previous_frame_is_refined_before_a_frame_is_tracked(demo: RGBDSequence)
     assert calls == ["nothing", "track", "refine 0", "track", "refine 1", "track"]
 
 
-def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(demo: RGBDSequence) -> None:
-    slam, delay = V3DSLAM(demo.camera, NoSegmentation()), 0.012
+@pytest.mark.parametrize("by_stamps", [0.012, 0.005, 0.0])
+def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(
+    by_stamps: float, demo: RGBDSequence
+) -> None:
+    """The delay of the depth image is that of its timestamp and that of the camera together."""
+    delay = 0.012
+    camera = replace(demo.camera, depth_delay=delay - by_stamps)
+    slam = V3DSLAM(camera, NoSegmentation())
     motions: list[CameraMotion] = []
     views: list[DepthView] = []
     slam.register_stage_hook("odometry", lambda name, args, motion: motions.append(motion))
     slam.register_stage_hook("free_space_check", lambda name, args, result: views.append(args[0]))
     for index in range(3):
         before = slam.poses.T_cw
-        slam(replace(demo[index], depth_delay=delay))
+        slam(replace(demo[index], depth_delay=by_stamps, camera=camera))
     T_dc = se3_exp(motions[-1].velocity * delay)
     assert float((T_dc - torch.eye(4)).abs().max()) > 1e-4  # the camera moves
     torch.testing.assert_close(views[-1].T_cw, T_dc @ motions[-1].T_cp @ before)

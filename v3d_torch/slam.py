@@ -22,8 +22,9 @@ from v3d_torch.mapping.landmark_ids import compact_landmarks
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.feature_support import FeatureSupport
-from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
+from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.image_scale import scale_to_image
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
@@ -72,9 +73,9 @@ class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     `preprocess` runs the stages that depend only on the frame, see `FramePreprocessor`; `track` runs the others. Every
-    stage is an attribute and can be replaced by a callable with the same signature; the results of the replacement are
-    checked. `estimate_motion`, `track_map` and `loop_closer` are used inside other stages and cannot be replaced alone.
-    Hooks see the arguments and results of stages, see `register_stage_hook`.
+    stage is an attribute and can be replaced by an object with the same methods; the results of stages that return data
+    are checked. `estimate_motion`, `track_map` and `loop_closer` are used inside other stages and cannot be replaced
+    alone. Hooks see the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -224,7 +225,8 @@ class V3DSLAM(FramePreprocessor):
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
             was_lost = self.poses.status is TrackingStatus.LOST
-            T_dc = se3_exp(motion.velocity * frame.depth_delay)  # from the time of the colour image to that of depth
+            delay = frame.depth_delay + self.camera.depth_delay
+            T_dc = se3_exp(motion.velocity * delay)  # from the time of the colour image to that of the depth image
             T_dw = T_dc @ self._compose_pose(motion)
             view = self.free_space_check.make_view(frame.stamp, depth, T_dw, is_motion_measured=motion.is_measured)
             newly_occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
@@ -256,14 +258,16 @@ class V3DSLAM(FramePreprocessor):
                 self.free_space_check.add_view(view, T_dc @ self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
-        with self.timer("tracking"):  # covariance of the pose, velocity of the camera
+        with self.timer("tracking"):  # covariance of the pose, twist of the camera
             references = None if keyframe is None else self.map.references
             state = self.estimate_state(pose, motion, self.poses, owners, references)
             self.states.append(state)
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
                 self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate())
-        objects = self.classify_motion.apply_corrections(objects)  # the world, since the objects were tracked
+        objects = self.classify_motion.apply_corrections(
+            objects
+        )  # corrections of the world since the objects were tracked
         return FrameResult(**vars(objects), **vars(state))
 
     def flush(self) -> None:
@@ -370,7 +374,7 @@ class V3DSLAM(FramePreprocessor):
     ) -> Keyframe | None:
         """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
         part, reference = self.poses.part, self.track_camera.reference_keyframe(pose, self.poses)
-        predicted_T_cw = self._compose_pose(motion)  # with the corrections of the world since the objects were measured
+        predicted_T_cw = self._compose_pose(motion)  # includes corrections of the world since the objects were tracked
         keyframe = self.mapper(frame, features, pose, reference)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
         self._apply_world_correction(T_new_old)
@@ -378,7 +382,7 @@ class V3DSLAM(FramePreprocessor):
         if is_elsewhere:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
         if pose.status is not TrackingStatus.LOST and T_new_old is None:
-            self.classify_motion.tracker.end_guess(invert(pose.T_cw) @ predicted_T_cw, all_tracks=is_elsewhere)
+            self.classify_motion.tracker.register(invert(pose.T_cw) @ predicted_T_cw, all_tracks=is_elsewhere)
         self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)

@@ -29,6 +29,9 @@ MIN_INTERVAL = 0.01
 """Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
 each other come from a computer that received two frames at once, and the camera has moved for longer."""
 
+STAMP_TOLERANCE = 1e-3
+"""Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
+
 
 @dataclass(frozen=True)
 class RGBDFrame:

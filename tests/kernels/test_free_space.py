@@ -11,7 +11,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
 from v3d_torch.objects import free_space_check
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.depth_view import DepthView
 
 pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
 

@@ -30,7 +30,7 @@ def test_dilation_equals_its_twin(size: tuple[int, int], density: float, radius:
 @pytest.mark.parametrize("measured", [0.0, 0.7, 1.0])
 @pytest.mark.parametrize("radius", [0, 1, 2, 6, 70])
 def test_nearest_depth_equals_its_twin(size: tuple[int, int], measured: float, radius: int) -> None:
-    twin = TWINS["v3d_torch.objects.free_space_check._nearest_depth"]
+    twin = TWINS["v3d_torch.objects.depth_view._nearest_depth"]
     depth = random_depth(size, measured)[0]
     assert torch.equal(twin.compiled(depth, radius), twin.torch(depth, radius))
 

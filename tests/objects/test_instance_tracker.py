@@ -631,13 +631,13 @@ def test_end_of_a_guess_moves_what_was_seen_since_or_all(all_tracks: bool) -> No
     offset[0, 3] = 0.3
     for frame in range(8):
         if frame == 5:
-            track_boards.tracker.start_guess(frame / 30)
+            track_boards.tracker.start_unregistered(frame / 30)
         depth, instances = render([Board(0.0)], HERE)
         (track,) = track_boards.track(depth, instances, frame / 30, T_wc=offset if frame >= 5 else HERE)
-    track_boards.tracker.end_guess(invert(offset), all_tracks=all_tracks)
+    track_boards.tracker.register(invert(offset), all_tracks=all_tracks)
     places = [round(float(detection.centroid[0]), 2) for detection in track.detections]
     assert places == (5 * [-0.3] + 3 * [0.0] if all_tracks else 8 * [0.0])
-    track_boards.tracker.end_guess(offset)  # no guess any more
+    track_boards.tracker.register(offset)  # no guess any more
     assert [round(float(detection.centroid[0]), 2) for detection in track.detections] == places
     assert all_tracks or float(track.velocity.norm()) < 0.05
 

@@ -13,8 +13,8 @@ from torch import Tensor
 from v3d_torch import V3DSLAM, RGBDFrame, load_config, load_sequence
 from v3d_torch.config import Config, ObjectsConfig
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.frame_objects import MotionState
-from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.mask_propagation import propagate_instances
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.segmentation.coco import UNLABELLED

@@ -8,7 +8,7 @@ from torch import Tensor
 from v3d_torch.config import StaticMaskConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import pack_masks
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import Detection3D, Track

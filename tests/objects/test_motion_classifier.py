@@ -19,9 +19,10 @@ from v3d_torch.config import ObjectsConfig
 from v3d_torch.config.loading import load_config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
-from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
+from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED

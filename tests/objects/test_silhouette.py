@@ -180,7 +180,7 @@ def test_every_nth_pixel_equals_the_full_mask(step: int) -> None:
     (silhouette,) = silhouettes([points(every=3)], CAMERA, SPACING)
     for include_missing in (False, True):
         all_of_them = silhouette.mask(depth, 8, TOLERANCE, include_missing=include_missing)
-        some = silhouette.mask(depth[:, ::step, ::step], 8, TOLERANCE, step=step, include_missing=include_missing)
+        some = silhouette.mask(depth[:, ::step, ::step], 8, TOLERANCE, stride=step, include_missing=include_missing)
         assert some.any() and torch.equal(some, all_of_them[::step, ::step])
 
 

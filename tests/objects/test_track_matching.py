@@ -107,7 +107,7 @@ def test_lost_walker_is_expected_where_a_person_slows_down() -> None:
         (track,) = track_boards(Board(-1.0 + frame / 30))
     stamp = track.newest.stamp + 0.4
     expected, constant = (
-        float(state.position[0]) for state in (track.predict_return(stamp), track.predict_state(stamp))
+        float(state.position[0]) for state in (track.predict_unobserved_state(stamp), track.predict_state(stamp))
     )
     assert constant - expected > 0.08
     ratios = []

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView, FreeSpaceCheck
+from v3d_torch.objects.depth_view import DepthView
+from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.unlabelled import unlabelled_instances
 from v3d_torch.segmentation.coco import COCO_NAMES, PERSON, UNLABELLED, class_name

@@ -122,7 +122,7 @@ def test_grid_of_a_room_shows_its_walls_also_in_a_tilted_world(twist: tuple[floa
 def test_grid_does_not_depend_on_the_size_of_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     occupancy = map_of(box_of_voxels((30, -5, 3), (33, -3, 40)), box_of_voxels((-20, -12, -20), (30, -1, 50)))
     whole = occupancy_grid(occupancy, FLOOR, HEIGHTS)
-    monkeypatch.setattr(voxel_blocks, "_PART", 1)
+    monkeypatch.setattr(voxel_blocks, "_CHUNK_BLOCKS", 1)
     parts = occupancy_grid(occupancy, FLOOR, HEIGHTS)
     assert torch.equal(parts.states, whole.states) and parts.origin == whole.origin
     assert len(whole.states.unique()) == 3
@@ -136,7 +136,7 @@ def test_grid_needs_no_points_of_the_whole_map(monkeypatch: pytest.MonkeyPatch) 
         sizes.append(mask.numel())
         return voxels_where(blocks, mask)
 
-    monkeypatch.setattr(voxel_blocks, "_PART", 2)
+    monkeypatch.setattr(voxel_blocks, "_CHUNK_BLOCKS", 2)
     monkeypatch.setattr(voxel_blocks.VoxelBlocks, "voxels_where", measured)
     occupancy_grid(occupancy, FLOOR, HEIGHTS)
     assert len(occupancy.blocks) > 4 and max(sizes) == 2 * VOLUME

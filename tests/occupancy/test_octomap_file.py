@@ -146,6 +146,6 @@ def test_file_does_not_depend_on_the_size_of_the_parts(
     room: OccupancyMap, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_octomap(tmp_path / "whole.bt", room)
-    monkeypatch.setattr(voxel_blocks, "_PART", 1)
+    monkeypatch.setattr(voxel_blocks, "_CHUNK_BLOCKS", 1)
     write_octomap(tmp_path / "parts.bt", room)
     assert (tmp_path / "parts.bt").read_bytes() == (tmp_path / "whole.bt").read_bytes()

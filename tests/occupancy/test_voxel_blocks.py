@@ -88,7 +88,7 @@ def test_blocks_are_adopted_from_a_grid_that_knows_twice_as_many_of_their_voxels
         marks = torch.where(torch.arange(VOLUME) < counts[rows, None], mark, 0).to(torch.uint8)
         grid.add(Observations(torch.stack([rows, -rows, rows], dim=1), marks), MODEL)
     own, other = grids
-    own.adopt_better_known(other)
+    own.copy_better_observed(other)
     voxels = SIDE * torch.tensor([[row, -row, row] for row in range(4)])
     assert own.log_odds_at(voxels).tolist() == [MODEL.miss, MODEL.hit, MODEL.miss, MODEL.hit]
     assert own.count_known()[own.find(voxels >> BITS)].tolist() == [10, 20, 10, 5]

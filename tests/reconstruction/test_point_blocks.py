@@ -9,7 +9,8 @@ from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.objects.free_space_check import DepthView, is_free_space
+from v3d_torch.objects.depth_view import DepthView
+from v3d_torch.objects.free_space_check import is_free_space
 from v3d_torch.reconstruction.point_blocks import PointBlocks
 
 

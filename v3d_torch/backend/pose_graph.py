@@ -22,7 +22,7 @@ from v3d_torch.kernels import pose_graph as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
-from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, huber, levenberg_marquardt
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
     common_batch,
@@ -34,10 +34,6 @@ from v3d_torch.runtime.batches import (
 
 if TYPE_CHECKING:
     import pypose as pp
-
-_REGULARISATION = 1e-9
-"""Number added to the diagonal of the normal equations, so that they have a solution for poses without any edge;
-negligible compared with the information of an edge."""
 
 
 class PoseGraphResult(NamedTuple):
@@ -173,7 +169,7 @@ class _Graph(NamedTuple):
 
     def step(self, T_wc: Tensor, system: tuple[Tensor, Tensor], damping: Tensor | float) -> Tensor:
         """Poses after one damped step."""
-        xi = solve_block_system(*system, self.edges, self.fixed, damping, _REGULARISATION)
+        xi = solve_block_system(*system, self.edges, self.fixed, damping, REGULARISATION)
         return torch.where(self.is_fixed, T_wc, T_wc @ se3_exp(xi))
 
     def differentiate(self, T_wc: Tensor, initial: Tensor) -> Tensor:
@@ -183,7 +179,7 @@ class _Graph(NamedTuple):
         blocks = jacobian(lambda xi: constant._gradient(ends, xi), T_wc.new_zeros(*self.edges.shape[:-1], 12))
         anchored = torch.where(self.is_fixed, initial, T_wc)
         gradient = self._gradient(self._ends(anchored), None)
-        steps = solve_block_system(blocks, gradient, self.edges, self.fixed, 0.0, _REGULARISATION)
+        steps = solve_block_system(blocks, gradient, self.edges, self.fixed, 0.0, REGULARISATION)
         return zero_with_gradient(steps)
 
     def _ends(self, T_wc: Tensor) -> tuple[Tensor, Tensor]:
@@ -210,7 +206,7 @@ def _minimise_compiled(T_wc: Tensor, *graph: Tensor, iterations: int, tolerance:
     batch, (*columns, limit) = T_wc.shape[:-3], graph
     if 0 in batch:
         return NotImplemented
-    settings = float(limit), iterations, tolerance, _REGULARISATION, DAMPING_SCHEDULE
+    settings = float(limit), iterations, tolerance, REGULARISATION, DAMPING_SCHEDULE
     rows = zip(*(to_rows(each, batch) for each in (T_wc, *columns)), strict=True)
     problems = [(*row, *settings) for row in rows]
     return PoseGraphResult(*from_rows([kernels.optimise_pose_graph(*problem) for problem in problems], batch))

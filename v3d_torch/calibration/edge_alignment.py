@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from v3d_torch.calibration.view_edges import ViewEdges, find_edges, view_pixels
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, transform_points
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.optim.jackknife import jackknife_covariance
 from v3d_torch.types import Trajectory
@@ -231,7 +231,7 @@ class EdgeAlignment:
     def _at_time_of_colour(self, delay: float) -> Tensor:
         """Pixels of the boundaries at the time of the colour image, if depth has an additional delay, (E, 2)."""
         T_cd = self._T_cw @ self._trajectory.poses_at(self._depth_stamp + delay)
-        moved = [points @ T[:3, :3].T + T[:3, 3] for points, T in zip(self._points, T_cd, strict=True)]
+        moved = [transform_points(T, points) for points, T in zip(self._points, T_cd, strict=True)]
         return self._camera.project(torch.cat(moved))
 
     def _mean_motion(self, delay: float) -> Tensor:

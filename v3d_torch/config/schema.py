@@ -79,7 +79,7 @@ class CloudConfig(Section):
     """Radius of DBSCAN, metres: four voxels bridge the depth steps of a Kinect at 4 m, but not a person and the wall
     behind."""
     min_samples: int = Field(5, gt=0)
-    """Minimum number of neighbours of a DBSCAN core point."""
+    """Minimum number of points within the radius of a DBSCAN core point, itself included."""
     min_points: int = Field(30, gt=0)
     """Minimum number of voxels of an object: the centroid of a smaller cluster is noise."""
 

@@ -16,13 +16,12 @@ from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_scale import MILLIMETRES
 from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.types import Trajectory
 
 _COLOUR = "d400_color_optical_frame"
 _BASE = "base_link"
-_DEPTH_SCALE = 1000.0
-"""Depth units per metre of the D435i: its depth is in millimetres."""
 
 
 class OpenLORISSequence(PairedImages):
@@ -46,7 +45,7 @@ class OpenLORISSequence(PairedImages):
             camera,
             lambda: _camera_poses(groundtruth, folder / "trans_matrix.yaml") if groundtruth.is_file() else None,
             published=lambda: _read_camera(folder / "sensors.yaml"),
-            depth_scale=_DEPTH_SCALE,
+            depth_scale=MILLIMETRES,
         )
 
 
@@ -66,7 +65,7 @@ def _read_camera(path: Path) -> PinholeCamera:
         raise InputError(
             f"{path}: has no {_COLOUR} with width, height and intrinsics; copy it again, or pass --camera"
         ) from error
-    fields |= {"distortion": distortion, "distortion_model": "plumb_bob", "depth_scale": _DEPTH_SCALE}
+    fields |= {"distortion": distortion, "distortion_model": "plumb_bob", "depth_scale": MILLIMETRES}
     return camera_from_fields(fields, str(path))
 
 

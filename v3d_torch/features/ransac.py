@@ -17,7 +17,7 @@ from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather
 from v3d_torch.features.usac import usac_options
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
-from v3d_torch.geometry.se3 import orthonormalise
+from v3d_torch.geometry.se3 import orthonormalise, transform_points
 from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
 from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
@@ -158,7 +158,7 @@ def pnp_ransac(
 
 def _squared_errors(T_cw: Tensor, points: Tensor, uv: Tensor, K: Tensor) -> Tensor:
     """Squared reprojection errors, square pixels, (..., N); infinite for points behind the camera."""
-    in_camera = points @ T_cw[..., :3, :3].mT + T_cw[..., None, :3, 3]
+    in_camera = transform_points(T_cw, points)
     xy = in_camera[..., :2] / in_camera[..., 2:].clamp(min=MIN_DEPTH)
     error = (xy * K.diagonal(dim1=-2, dim2=-1)[..., None, :2] + K[..., None, :2, 2] - uv).square().sum(dim=-1)
     return torch.where(in_camera[..., 2] > MIN_DEPTH, error, torch.inf)

@@ -19,7 +19,7 @@ from v3d_torch.geometry.se3 import hat, se3_exp
 from v3d_torch.kernels import sampson as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
 from v3d_torch.optim.implicit import jacobian, zero_with_gradient
-from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt, select
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, levenberg_marquardt, select
 from v3d_torch.runtime.batches import to_rows
 
 _ROUNDS = 3
@@ -27,9 +27,6 @@ _ROUNDS = 3
 
 _ITERATIONS, _TOLERANCE = 10, 1e-6
 """Maximum number of steps in a round, and relative change of the cost that ends the round."""
-
-_REGULARISATION = 1e-9
-"""Number added to the diagonal of the normal equations, which are singular without inliers."""
 
 
 State = tuple[Tensor, Tensor]
@@ -121,7 +118,7 @@ def _length(line_a: Tensor, line_b: Tensor) -> Tensor:
 
 
 def _regularise(H: Tensor) -> Tensor:
-    return H + _REGULARISATION * torch.eye(5, dtype=H.dtype, device=H.device)
+    return H + REGULARISATION * torch.eye(5, dtype=H.dtype, device=H.device)
 
 
 def _step(state: State, system: State, damping: Tensor) -> State:
@@ -134,7 +131,7 @@ def _minimise_compiled(
     U: Tensor, V: Tensor, K_inverse: Tensor, a: Tensor, b: Tensor, weights: Tensor, valid: Tensor, threshold: float
 ) -> tuple[Tensor, ...]:
     batch = U.shape[:-2]
-    settings = threshold, _ROUNDS, _ITERATIONS, _TOLERANCE, _REGULARISATION, DAMPING_SCHEDULE
+    settings = threshold, _ROUNDS, _ITERATIONS, _TOLERANCE, REGULARISATION, DAMPING_SCHEDULE
     columns = U, V, K_inverse, a, b, weights, valid
     arguments: tuple[Any, ...] = (*(to_rows(column, batch) for column in columns), *settings)
     results = kernels.refine_essential(*arguments)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
+from v3d_torch.kernels.camera import MIN_RADIUS
 
 DistortionModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 """Name of a distortion model."""
@@ -32,9 +33,6 @@ _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
 
 _FISHEYE_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
 """The tolerance is in radians."""
-
-_MIN_RADIUS = 1e-9
-"""Keeps the direction of a point on the optical axis finite, normalised image coordinates."""
 
 
 def complete_distortion(given: object, model: str) -> tuple[tuple[float, ...], DistortionModel]:
@@ -82,7 +80,7 @@ def distort(xy: Tensor, model: DistortionModel, coefficients: tuple[float, ...])
     r2 = xy.square().sum(dim=1, keepdim=True)
     if model == "equidistant":
         k1, k2, k3, k4 = coefficients
-        r = r2.clamp(min=_MIN_RADIUS**2).sqrt()
+        r = r2.clamp(min=MIN_RADIUS**2).sqrt()
         theta = torch.atan(r)
         t2 = theta.square()
         return xy * (theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r)

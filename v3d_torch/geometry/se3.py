@@ -1,4 +1,4 @@
-"""SE(3) as 4x4 matrices: exponential, logarithm, inverse, adjoint, Jacobian of the logarithm.
+"""SE(3) as 4x4 matrices: exponential, logarithm, inverse, action on points, adjoint, Jacobian of the logarithm.
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
 All functions are batched over leading dimensions, differentiable, and meant for float64; half precision is computed in
@@ -161,6 +161,20 @@ def se3_log(T: Tensor) -> Tensor:
     t = T[..., :3, 3:]
     rho = t - 0.5 * (K @ t) + c * (K @ (K @ t))
     return torch.cat([rho[..., 0], phi], dim=-1).to(dtype)
+
+
+def transform_points(T_ba: Tensor, points: Tensor) -> Tensor:
+    """Transform points from frame a to frame b.
+
+    Args:
+        T_ba: Transform, shape :math:`(*, 4, 4)`; converted to the dtype of the points.
+        points: Points in frame a, shape :math:`(*, N, 3)`.
+
+    Returns:
+        Points in frame b, shape :math:`(*, N, 3)`.
+    """
+    T = T_ba.to(points)
+    return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
 def interpolate(T_a: Tensor, T_b: Tensor, fraction: Tensor) -> Tensor:

@@ -14,8 +14,8 @@ Bounds = tuple[float, float, float, float, float, float]
 """Minimum and maximum of x / z and of y / z in the image, width and height; in signatures ``UniTuple(f8, 6)``."""
 
 
-_MIN_RADIUS = 1e-9
-"""Minimum distance from the optical axis, the same as in `v3d_torch.geometry.distortion`."""
+MIN_RADIUS = 1e-9
+"""Minimum distance from the optical axis, normalised image coordinates: it keeps directions on the axis finite."""
 
 
 @device
@@ -24,7 +24,7 @@ def distort(x: float, y: float, intrinsics: Intrinsics) -> tuple[float, float]:
     fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6, equidistant = intrinsics
     r2 = x * x + y * y
     if equidistant != 0:
-        r = max(math.sqrt(r2), _MIN_RADIUS)
+        r = max(math.sqrt(r2), MIN_RADIUS)
         theta = math.atan(r)
         t2 = theta * theta
         factor = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r

@@ -25,7 +25,7 @@ def _select_largest(labels: Ints) -> Mask:
 
 @kernel("(f4[:,::1], b1[:,::1], f4[:,::1], i8, f4, f4, f8, i8, b1[:,::1])")
 def instance_cloud(
-    depth: Depth, mask: Mask, rays: Points, step: int, max_depth: np.float32, voxel_size: np.float32, eps: float,
+    depth: Depth, mask: Mask, rays: Points, stride: int, max_depth: np.float32, voxel_size: np.float32, eps: float,
     min_samples: int, cloud_pixels: Mask,
 ) -> tuple[Points, Mask]:  # fmt: skip
     """Back-project one instance, pool its points, and select the largest cluster.
@@ -34,7 +34,7 @@ def instance_cloud(
         depth: Depth, metres, (H, W); 0 = no measurement.
         mask: Pixels of the instance, (H, W).
         rays: Ray of every n-th pixel, in row-major order, (R, 3).
-        step: Step n between the pixels.
+        stride: Step n between the pixels.
         max_depth: Largest depth of a point, metres.
         voxel_size: Side of a voxel, metres.
         eps: Radius of DBSCAN, metres.
@@ -46,8 +46,8 @@ def instance_cloud(
     """
     height, width = depth.shape
     points, pixels, count, ray = np.empty((len(rays), 3), np.float32), np.empty((len(rays), 2), np.int64), 0, 0
-    for row in range(0, height, step):
-        for column in range(0, width, step):
+    for row in range(0, height, stride):
+        for column in range(0, width, stride):
             z = depth[row, column]
             if mask[row, column] and z > 0 and z <= max_depth:
                 for axis in range(3):
@@ -60,7 +60,7 @@ def instance_cloud(
     for i in range(count):
         if selected[voxels[i]]:
             row, column = pixels[i]
-            for v in range(row, min(row + step, height)):
-                for u in range(column, min(column + step, width)):
+            for v in range(row, min(row + stride, height)):
+                for u in range(column, min(column + stride, width)):
                     cloud_pixels[v, u] = mask[v, u]
     return means, selected

@@ -67,7 +67,7 @@ def _intersect(a: Mask, b: Mask, both: Mask) -> None:
 
 @kernel("(i4[:,::1], i8, u1[:,::1], u1[:,::1], i8, f8)")
 def fill_components(
-    components: NDArray[np.int32], count: int, seeds: Mask, reachable: Mask, step: int, min_fraction: float
+    components: NDArray[np.int32], count: int, seeds: Mask, reachable: Mask, stride: int, min_fraction: float
 ) -> Mask:
     """Select the reachable pixels of the components with enough seeds, and of their neighbour cells.
 
@@ -76,7 +76,7 @@ def fill_components(
         count: Number of components, including component 0.
         seeds: Seed cells, (h, w).
         reachable: Reachable pixels, (H, W).
-        step: Side of a cell, pixels.
+        stride: Side of a cell, pixels.
         min_fraction: Minimum fraction of seeds in a component.
 
     Returns:
@@ -97,8 +97,8 @@ def fill_components(
                 cells[y + 1, x] = cells[y + 1, x + 1] = cells[y + 1, x + 2] = cells[y, x + 1] = cells[y + 2, x + 1] = 1
     surface, pixels = np.empty_like(reachable), np.empty(reachable.shape[1], np.uint8)
     for v in range(len(reachable)):
-        if v % step == 0:
+        if v % stride == 0:
             for u in range(len(pixels)):
-                pixels[u] = cells[v // step + 1, u // step + 1]
+                pixels[u] = cells[v // stride + 1, u // stride + 1]
         _intersect(pixels, reachable[v], surface[v])
     return surface

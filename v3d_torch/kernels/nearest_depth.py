@@ -1,4 +1,4 @@
-"""Kernel of the minimum depth around pixels; see `v3d_torch.objects.free_space_check`."""
+"""Kernel of the minimum depth around pixels; see `v3d_torch.objects.depth_view`."""
 
 from __future__ import annotations
 

@@ -90,18 +90,18 @@ def select_pixels(
         minima: Minimum of z and of -z around each cell, metres, (rows, columns, 2).
         depth: Depth of every n-th pixel, metres, (h, w); 0 = no measurement.
         box: First and last row (exclusive), first and last column (exclusive) of the box.
-        grid: Row and column of the first cell, side of the cells in pixels, step n.
+        grid: Row and column of the first cell, side of the cells in pixels, stride n.
         tolerance: Tolerance of the depth, metres.
         no_depth: Pixels without depth are selected if the lower limit is below this depth, metres; 0 to select none.
         mask: Selected pixels, (h, w); written in the box.
     """
     begin, end, left, right = box
-    top, first, cell, step = grid
+    top, first, cell, stride = grid
     low, high = np.empty(right - left, np.float32), np.empty(right - left, np.float32)
-    columns = np.arange(left, right) * step // cell - first
+    columns = np.arange(left, right) * stride // cell - first
     previous = -1
     for v in range(begin, end):
-        row = v * step // cell - top
+        row = v * stride // cell - top
         if row != previous:
             for i in range(len(columns)):
                 low[i] = minima[row, columns[i], 0] - tolerance

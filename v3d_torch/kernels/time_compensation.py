@@ -36,7 +36,7 @@ def compensate_depth_delay(
         inverse_depth: Inverse depth before the compensation, 1/m, (N,); 0 = no measurement.
         depth_image: Depth image, metres, (H, W); 0 = no measurement.
         velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
-        delay: Depth stamp minus colour stamp, seconds.
+        delay: Time of the depth image minus time of the colour image, seconds.
         max_depth: Depth above this counts as missing, metres.
         intrinsics: ``fx, fy, cx, cy``.
     """

@@ -35,24 +35,24 @@ def local_index(x: int, y: int, z: int) -> int:
 
 @kernel("(i1[:,::1], i8[::1], u1[:,::1], i8, i8, i8, i8)")
 def add_observations(
-    log_odds: NDArray[np.int8], slots: Ints, marks: Marks, hit: int, miss: int, minimum: int, maximum: int
+    log_odds: NDArray[np.int8], rows: Ints, marks: Marks, hit: int, miss: int, minimum: int, maximum: int
 ) -> None:
     """Add the observations of one view to the log-odds of blocks.
 
     Args:
         log_odds: Log-odds of all blocks, steps, (N, 4096); changed in place.
-        slots: Row of each observed block, (B,).
+        rows: Row of each observed block, (B,).
         marks: Observations, (B, 4096).
         hit: Log-odds added to a voxel that was hit, steps.
         miss: Log-odds added to a voxel that was observed as free, steps.
         minimum: Smallest log-odds, steps.
         maximum: Largest log-odds, steps.
     """
-    for i in range(len(slots)):
-        row = log_odds[slots[i]]
+    for i in range(len(rows)):
+        block = log_odds[rows[i]]
         for voxel in range(VOLUME):
             mark = marks[i, voxel]
             if mark:
-                before = 0 if row[voxel] == UNKNOWN else np.int64(row[voxel])
+                before = 0 if block[voxel] == UNKNOWN else np.int64(block[voxel])
                 after = before + (hit if mark == HIT else miss)
-                row[voxel] = np.int8(min(max(after, minimum), maximum))
+                block[voxel] = np.int8(min(max(after, minimum), maximum))

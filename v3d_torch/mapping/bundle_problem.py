@@ -1,7 +1,8 @@
 """Least-squares problem of a bundle adjustment: residuals, normal equations, steps, derivatives of the optimum.
 
-The last dimension of all tensors is that of the observations. An observation depends on nine unknowns, the left
-perturbation of its pose and the shift of its point, and adds a 9x9 block to the normal equations.
+The observations are the last dimension of all tensors that have one value for each of them. An observation depends on
+nine unknowns, the left perturbation of its pose and the shift of its point, and adds a 9x9 block to the normal
+equations.
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
     """
     # NumPy is faster here than torch, and indices are faster than a mask.
     keyframe, landmark, valid = (tables.observations[name].numpy() for name in ("keyframe", "landmark", "valid"))
-    is_wanted = contains(landmarks.numpy(), landmark, len(tables.landmarks))
-    observers = keyframe[np.flatnonzero(is_wanted & valid)]
+    is_given = contains(landmarks.numpy(), landmark, len(tables.landmarks))
+    observers = keyframe[np.flatnonzero(is_given & valid)]
     return torch.from_numpy(np.bincount(observers, minlength=len(tables.keyframes)))
 
 

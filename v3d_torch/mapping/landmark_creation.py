@@ -8,7 +8,7 @@ from torch import Tensor
 from v3d_torch.config import FeaturesConfig
 from v3d_torch.features.features import Features, select_evenly
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, transform_points
 from v3d_torch.runtime.tensor_table import TensorTable
 
 
@@ -43,7 +43,7 @@ def landmark_points(T_wc: Tensor, features: Features, camera: PinholeCamera) -> 
     Returns:
         Points, world frame, metres, float64, shape :math:`(N, 3)`.
     """
-    return camera.back_project(features.uv, features.depth) @ T_wc[:3, :3].T + T_wc[:3, 3]
+    return transform_points(T_wc, camera.back_project(features.uv, features.depth))
 
 
 def create_landmarks(

@@ -14,6 +14,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import to_measurements
 from v3d_torch.features.projection_matcher import ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.membership import contains
@@ -63,7 +64,7 @@ class LandmarkFusion:
         projected = self._match.project(keyframe.T_cw, local)
         row, feature = self._match(features, projected, local, _SEARCH_RADIUS).unbind(dim=1)
         # Reject matches by reprojection error, depth included.
-        in_camera = local.points[row] @ keyframe.T_cw[:3, :3].T + keyframe.T_cw[:3, 3]
+        in_camera = transform_points(keyframe.T_cw, local.points[row])
         measured = to_measurements(features[feature], config.tracking, config.features)
         inliers = (
             chi_square(in_camera, reprojection_residuals(in_camera, measured, self._camera.K))

@@ -99,7 +99,7 @@ class MapTables:
         return max((keyframe.part for keyframe in self.keyframes), default=0) + 1
 
     def keyframe_at(self, stamp: float) -> Keyframe | None:
-        """Return the newest keyframe if the frame at a time became it; None otherwise.
+        """Return the newest keyframe if it was created from the frame at a time; None otherwise.
 
         Times identify frames: they increase, whereas the indices of a camera begin again when it is started again.
 

@@ -153,9 +153,9 @@ class SparseMap(MapTables):
     def update_features(self, keyframe: Keyframe, features: Features, T_cw: Tensor | None = None) -> None:
         """Replace the features of a keyframe by the same features with corrected pixels and depth.
 
-        Landmarks that no other keyframe observes move with their feature if the pose is correct: it was refined with
-        these features, or does not depend on features, because the keyframe created all landmarks that it observes, as
-        the first one. In other keyframes they wait for the bundle adjustment, which also corrects the pose.
+        Landmarks that only this keyframe observes are computed again from its features, if ``T_cw`` is given, or if the
+        keyframe created all landmarks that it observes, so that its pose does not depend on features. Otherwise the
+        next bundle adjustment corrects them together with the pose.
 
         Args:
             keyframe: Keyframe of this map.

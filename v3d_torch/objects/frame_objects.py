@@ -18,8 +18,8 @@ class MotionState(StrEnum):
     STATIC = "static"
     """At rest: its pixels are tracked and, unless it is a person, mapped."""
     DYNAMIC = "dynamic"
-    """It moved: most of it is where an earlier view saw free space, or most of its former place is free now and enough
-    objects vote for it."""
+    """It moved recently: most of it is where an earlier view saw free space, or most of its former place is free now
+    and enough objects vote for it, or its features moved against the camera motion."""
     DEFORMING = "deforming"
     """A person or animal that changes its shape in place, by the Chamfer distance."""
     UNKNOWN = "unknown"
@@ -33,9 +33,9 @@ class TrackedObject:
     Attributes:
         id: Number of the object.
         label: COCO class index; see `name` for the class name.
-        mask: Pixels of the object, bool, shape :math:`(H, W)`; empty if it is hidden, or missed for more than 0.1 s,
-            because later predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes the predicted
-            pixels.
+        mask: Pixels of the object, bool, shape :math:`(H, W)`. A predicted mask lacks the pixels of detected objects of
+            the class, and is empty if the object is hidden, not confirmed, or missed for more than 0.1 s, because later
+            predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes all predicted pixels.
         state: Position of the visible part and velocity, with their covariance, at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the time spans; the free-space check has one vote.
@@ -94,10 +94,10 @@ class FrameObjects:
         Args:
             up: Direction against gravity, world frame, shape :math:`(3,)`, such as `V3DSLAM.up`.
         """
-        located = [each for each in self.objects if len(each.cloud) and each.state.is_known]
+        with_centroid = [each for each in self.objects if len(each.cloud) and each.state.is_known]
         clouds = [
             each.cloud + (each.centroid - each.cloud.double().mean(dim=0)) if each.missed else each.cloud
-            for each in located
+            for each in with_centroid
         ]
-        boxes = upright_boxes(clouds, up, [each.state.velocity for each in located])
-        return {each.id: box for each, box in zip(located, boxes, strict=True)}
+        boxes = upright_boxes(clouds, up, [each.state.velocity for each in with_centroid])
+        return {each.id: box for each, box in zip(with_centroid, boxes, strict=True)}

@@ -10,28 +10,22 @@ position, the point has appeared.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Protocol
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.kernels import free_space as kernels
-from v3d_torch.kernels import nearest_depth as depth_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.objects.depth_view import DepthView, SpaceView, StoredView
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.objects.track import STAMP_TOLERANCE
-from v3d_torch.types import MIN_INTERVAL
-
-_POSE_ERROR = 0.01
-"""Reprojection error of a view's pose, as a fraction of the image width: 0.6 degrees of a Kinect's field of view."""
+from v3d_torch.types import MIN_INTERVAL, STAMP_TOLERANCE
 
 _COLUMNS = 160
 """Number of pixels checked in a row: every 4th of a Kinect's. They are 2 cm apart at 2.5 m, as dense as the clouds."""
@@ -39,96 +33,6 @@ _COLUMNS = 160
 _VIEW_MARGIN = 0.2
 """Views are kept for this much longer than the longest time span, seconds: at 5 frames per second, the newest view that
 is at least as old as the time span can be one frame interval older."""
-
-
-class SpaceView(Protocol):
-    """What the check needs of a view: `DepthView` or `StoredView`."""
-
-    @property
-    def T_cw(self) -> Tensor:
-        """World-to-camera pose, float64, shape :math:`(4, 4)`."""
-
-    @property
-    def nearest_depth(self) -> Tensor:
-        """Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without depth."""
-
-
-@dataclass(frozen=True)
-class StoredView:
-    """View that later frames are compared with.
-
-    Attributes:
-        stamp: Timestamp, seconds.
-        nearest_depth: Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without
-            depth.
-        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-    """
-
-    stamp: float
-    nearest_depth: Tensor
-    T_cw: Tensor
-
-
-@dataclass(frozen=True)
-class DepthView:
-    """Depth image of the current frame with its pose.
-
-    Attributes:
-        stamp: Timestamp, seconds.
-        depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-        T_cw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
-        misalignment: Largest offset of the depth of a pixel from that pose, pixels. It arises when the camera turns
-            while the image is read.
-        is_motion_measured: True if the motion of the camera since the previous frame is measured; otherwise the pose is
-            a guess.
-    """
-
-    stamp: float
-    depth: Tensor
-    T_cw: Tensor
-    misalignment: int = 0
-    is_motion_measured: bool = True
-
-    @cached_property
-    def missing(self) -> Tensor:
-        """Pixels without depth, bool, shape :math:`(H, W)`."""
-        return torch.from_numpy(self.depth[0].numpy() <= 0)  # NumPy is faster here than torch
-
-    @cached_property
-    def nearest_depth(self) -> Tensor:
-        """Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without depth.
-
-        A position is free only if all measurements around it lie behind it. Otherwise a surface at a grazing angle, or
-        a pose that is off by some pixels, would make static points appear or vacate.
-        """
-        return _nearest_depth(self.depth[0], round(_POSE_ERROR * self.depth.shape[2]) + self.misalignment)
-
-
-def erode_measured(depth: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Return the minimum depth in a square around each pixel; pixels without depth are ignored.
-
-    Args:
-        depth: Depth, metres, shape :math:`(H, W)`; 0 = no measurement.
-        size: Side of the square, pixels.
-
-    Returns:
-        Depth, metres, shape :math:`(H, W)`; the largest float32 if the square has no measurement.
-    """
-    no_depth = cv2.threshold(depth, 0, float(np.finfo(np.float32).max), cv2.THRESH_BINARY_INV)[1]
-    return np.asarray(cv2.erode(depth + no_depth, np.ones((size, size), np.uint8)), np.float32)
-
-
-def _nearest_depth_compiled(depth: Tensor, radius: int) -> Tensor:
-    if depth.dtype != torch.float32:
-        return NotImplemented
-    return torch.from_numpy(depth_kernels.nearest_depth(to_array(depth), radius))
-
-
-@compiled_by(_nearest_depth_compiled)
-def _nearest_depth(depth: Tensor, radius: int) -> Tensor:
-    """Return the minimum depth within a radius of each pixel, (H, W); 0 for a pixel without depth."""
-    array = depth.numpy()
-    return torch.from_numpy(erode_measured(array, 2 * radius + 1) * (array > 0))
 
 
 def _limits(config: FreeSpaceConfig) -> kernels.Limits:
@@ -309,7 +213,7 @@ class FreeSpaceCheck:
         self._views = [stored for stored in self._views if stored.stamp >= oldest] + [new]
 
     def drop_views(self) -> None:
-        """Forget the stored views, because the pose relative to them is not known."""
+        """Remove the stored views, because the pose relative to them is not known."""
         self._views = []
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:

@@ -107,12 +107,12 @@ def _with_centroids(points: Tensor, valid: Tensor, cloud_pixels: Tensor, min_poi
     return InstanceClouds(points, valid, centroid, cloud_pixels)
 
 
-def _cloud_pixels(masks: Tensor, valid: Tensor, voxel: Tensor, pixel: Tensor, step: int) -> Tensor:
+def _cloud_pixels(masks: Tensor, valid: Tensor, voxel: Tensor, pixel: Tensor, stride: int) -> Tensor:
     """Return the pixels of each mask whose point lies in a valid voxel, bool, shape (N, H, W)."""
-    cells = torch.zeros_like(masks[:, ::step, ::step])
+    cells = torch.zeros_like(masks[:, ::stride, ::stride])
     instance, point = torch.nonzero(voxel >= 0, as_tuple=True)
     cells.flatten(1)[instance, pixel[instance, point]] = valid[instance, voxel[instance, point]]
-    return upsample_nearest(cells.numpy(), step, masks.shape[-2:]) & masks
+    return upsample_nearest(cells.numpy(), stride, masks.shape[-2:]) & masks
 
 
 def _back_project(
@@ -123,9 +123,9 @@ def _back_project(
     Returns:
         Points :math:`(N, P, 3)`, their validity :math:`(N, P)`, and their row-major pixel indices :math:`(N, P)`.
     """
-    step = config.stride
-    z = depth[::step, ::step].numpy()
-    selected = masks.numpy()[:, ::step, ::step] & ((z > 0) & (z <= config.max_depth))
+    stride = config.stride
+    z = depth[::stride, ::stride].numpy()
+    selected = masks.numpy()[:, ::stride, ::stride] & ((z > 0) & (z <= config.max_depth))
     count = np.count_nonzero(selected, axis=(1, 2))
     valid = np.arange(max(count.max(initial=0), 1)) < count[:, None]
     pixel = np.flatnonzero(selected) % z.size

@@ -15,7 +15,7 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
-from v3d_torch.objects.track import STAMP_TOLERANCE, Track
+from v3d_torch.objects.track import Track
 from v3d_torch.objects.track_matching import (
     DetectedInstances,
     PredictedTracks,
@@ -25,7 +25,7 @@ from v3d_torch.objects.track_matching import (
     predict_tracks,
 )
 from v3d_torch.segmentation.coco import UNLABELLED
-from v3d_torch.types import Instances
+from v3d_torch.types import STAMP_TOLERANCE, Instances
 
 _COARSE_COLUMNS = 160
 """Number of columns of the coarse masks that are compared: more than the network's own masks have, which is 104 by
@@ -55,12 +55,14 @@ _MAX_OBSERVED_TIME = 0.2
 class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
-    The instances of a frame continue tracks in four stages, each an optimal assignment: first confirmed tracks, then
-    those without masks, then new ones that are not confirmed yet; instances without a class continue what is left. An
-    instance that was propagated continues the track from which it comes. If an object is not detected any more and may
-    move, its mask is predicted for a short time. An object that does not move has no mask in this time, because
-    tracking uses its pixels; it is called resting. Then both are lost: they keep their ids for some seconds, in case
-    they were hidden or out of view. The state (tracks and next id) is part of ``state_dict()``.
+    The instances of a frame continue tracks in five stages, each an optimal assignment. Instances with a class continue
+    confirmed tracks with a class, then resting and lost tracks, then all other tracks. Instances without a class
+    continue tracks without a class, then those with one. An instance that was propagated continues its own track.
+
+    If an object is not detected any more and may move, its mask is predicted for a short time. An object that does not
+    move has no mask in this time, because tracking uses its pixels; it is called resting. Then both are lost: they keep
+    their ids for some seconds, in case they were hidden or out of view. The state (tracks and next id) is part of
+    ``state_dict()``.
 
     Args:
         config: Gates and times.
@@ -87,7 +89,7 @@ class InstanceTracker(torch.nn.Module):
         self.resting: list[Track] = []
         self.lost: list[Track] = []
         self.comparable_since = -torch.inf
-        self._is_guess = False  # the world frame of the detections since then
+        self._is_unregistered = False  # True if the world frame of the detections since then is not that of the map
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the tracks and the next id, for ``state_dict()``."""
@@ -98,7 +100,7 @@ class InstanceTracker(torch.nn.Module):
             "next_id": self._next_id,
             "last_stamp": self._last_stamp,
             "comparable_since": self.comparable_since,
-            "is_guess": self._is_guess,
+            "is_unregistered": self._is_unregistered,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -110,7 +112,7 @@ class InstanceTracker(torch.nn.Module):
         self.tracks, self.resting = list(state["tracks"]), list(state["resting"])
         self.lost = list(state["lost"])
         self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
-        self.comparable_since, self._is_guess = state["comparable_since"], state["is_guess"]
+        self.comparable_since, self._is_unregistered = state["comparable_since"], state["is_unregistered"]
 
     def forward(
         self,
@@ -171,30 +173,31 @@ class InstanceTracker(torch.nn.Module):
         for track in (*self.tracks, *self.resting, *self.lost):
             track.apply_world_correction(T_new_old)
 
-    def start_guess(self, stamp: float) -> None:
+    def start_unregistered(self, stamp: float) -> None:
         """Record that the motion of the camera before a frame was not measured.
 
-        Detections from now on are not compared with earlier ones, and their world frame is a guess until `end_guess`.
+        Detections from now on are not compared with earlier ones, and their world frame is not that of the map until
+        `register`.
 
         Args:
             stamp: Timestamp of the frame, seconds.
         """
-        self.comparable_since, self._is_guess = stamp, True
+        self.comparable_since, self._is_unregistered = stamp, True
 
-    def end_guess(self, T_map_guess: Tensor, *, all_tracks: bool = False) -> None:
-        """Transform the detections since `start_guess` into the map, in which the camera was found.
+    def register(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
+        """Transform the detections since `start_unregistered` into the world frame of the map.
 
         Args:
-            T_map_guess: Transform from the guessed world frame to the world frame of the map, float64, shape
+            T_new_old: Transform from the world frame of these detections to that of the map, float64, shape
                 :math:`(4, 4)`.
             all_tracks: True to transform all detections, because they were made in another part of the map.
         """
         if all_tracks:
-            self.apply_world_correction(T_map_guess)
-        elif self._is_guess:
+            self.apply_world_correction(T_new_old)
+        elif self._is_unregistered:
             for track in (*self.tracks, *self.resting, *self.lost):
-                track.apply_world_correction(T_map_guess, self.comparable_since)
-        self._is_guess = False
+                track.apply_world_correction(T_new_old, self.comparable_since)
+        self._is_unregistered = False
 
     def _continued_tracks(self, instances: Instances) -> dict[int, Track]:
         """Return the track of each instance of which it is known, by its index."""
@@ -309,16 +312,16 @@ class InstanceTracker(torch.nn.Module):
         return missed
 
     def _update_tracks_without_masks(self, stamp: float, resting: Sequence[Track], lost: Sequence[Track]) -> None:
-        """Store resting tracks, or lose them if they were missed for too long; forget lost tracks after some time."""
+        """Store resting tracks, or lose them if they were missed for too long; remove lost tracks after some time."""
         longest = self._config.max_missed_time
         self.resting = [track for track in resting if stamp - track.newest.stamp <= longest]
         lost = [*lost, *(track for track in resting if stamp - track.newest.stamp > longest)]
         for track in lost:
             track.drop_masks()
             track.drop_old_detections()
-        remembered = longest + self._config.max_lost_time
+        max_age = longest + self._config.max_lost_time
         candidates = [*self.lost, *(track for track in lost if track.is_confirmed)]
-        self.lost = [track for track in candidates if stamp - track.newest.stamp <= remembered]
+        self.lost = [track for track in candidates if stamp - track.newest.stamp <= max_age]
 
     def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
         """Check for each track whether its predicted mask shows the surface of a detected track of the same class.
@@ -331,13 +334,13 @@ class InstanceTracker(torch.nn.Module):
             coarse_masks: Their predicted coarse masks where there is depth, packed, shape (T, B).
             updated: Tracks that were detected.
         """
-        located = [track for track in updated if track.newest.has_centroid]
-        if not located or not tracks:
+        with_centroid = [track for track in updated if track.newest.has_centroid]
+        if not with_centroid or not tracks:
             return [False] * len(tracks)
-        surfaces = pack_masks(torch.stack([other.cloud_pixels for other in located]), self._stride)
+        surfaces = pack_masks(torch.stack([other.cloud_pixels for other in with_centroid]), self._stride)
         common = count_common_pixels(coarse_masks, surfaces)
         is_over = common > self._config.min_overlap * count_pixels(coarse_masks)[:, None]
-        same_class = torch.tensor([[track.label == other.label for other in located] for track in tracks])
+        same_class = torch.tensor([[track.label == other.label for other in with_centroid] for track in tracks])
         covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
         return covered
 

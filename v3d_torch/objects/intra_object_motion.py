@@ -10,6 +10,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.objects.chamfer import chamfer_distance
 
 
@@ -74,8 +75,7 @@ def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
     KORNIA_CHECK_SHAPE(T, ["4", "4"] if T.ndim == 2 else [str(points.shape[0]), "4", "4"])
     if valid is not None:
         points = torch.where(valid[..., None], points, 0)
-    T = T.to(points)
-    return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
+    return transform_points(T, points)
 
 
 class IntraObjectMotion(torch.nn.Module):

@@ -32,14 +32,14 @@ def look_up(masks: Sequence[Tensor], pixel: Tensor) -> Tensor:
     return torch.from_numpy(np.stack([mask.numpy().take(index) for mask in masks]))
 
 
-def subsample(images: Tensor, step: int) -> Tensor:
+def subsample(images: Tensor, stride: int) -> Tensor:
     """Return every n-th row and column of images or masks, shape :math:`(*, h, w)`.
 
     Args:
         images: Images, shape :math:`(*, H, W)`.
-        step: Step n between the pixels.
+        stride: Step n between the pixels.
     """
-    return torch.from_numpy(np.ascontiguousarray(images.numpy()[..., ::step, ::step]))
+    return torch.from_numpy(np.ascontiguousarray(images.numpy()[..., ::stride, ::stride]))
 
 
 def upsample_nearest(cells: NDArray[np.generic], cell_size: int, image_size: Sequence[int]) -> Tensor:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Track, predict_clouds
 from v3d_torch.segmentation.coco import UNLABELLED
@@ -58,7 +58,7 @@ def propagate_instances(
     return replace(Instances.from_masks(torch.stack([*masks.values()]), labels), track_ids=track_ids)
 
 
-def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float, *, step: int = 1) -> Tensor:
+def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float, *, stride: int = 1) -> Tensor:
     """Return the pixels near the predicted points that have their depth.
 
     Without a centroid, the pixels of the last mask at which no points are measured belong to the object as well. The
@@ -69,14 +69,14 @@ def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth:
         silhouette: Projection of its predicted cloud.
         depth: Depth of every n-th pixel, metres, shape :math:`(1, h, w)`; 0 = no measurement.
         max_depth: Maximum depth of points, metres.
-        step: Step n between the pixels of ``depth``.
+        stride: Step n between the pixels of ``depth``.
 
     Returns:
         Mask of every n-th pixel, bool, shape :math:`(h, w)`.
     """
-    mask = silhouette.mask(depth, 0, DEPTH_TOLERANCE, step=step, include_missing=True)
+    mask = silhouette.mask(depth, 0, DEPTH_TOLERANCE, stride=stride, include_missing=True)
     if track.newest.has_centroid:
         return mask
     z = depth[0].numpy()  # NumPy is faster here than torch
     has_points = (z > 0) & (z <= max_depth)
-    return torch.from_numpy(mask.numpy() | (track.mask.numpy()[::step, ::step] & ~has_points))
+    return torch.from_numpy(mask.numpy() | (track.mask.numpy()[::stride, ::stride] & ~has_points))

@@ -21,7 +21,7 @@ from v3d_torch.config import StaticMaskConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_ops import dilate, ellipse, subsample, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import silhouettes
@@ -33,7 +33,7 @@ _TOLERANCE_GROWTH = 0.01
 depth of a structured-light camera."""
 
 _MIN_PART_RADIUS = 8
-"""Minimum radius of a part of a mask that is kept because its surface is not known, pixels."""
+"""Minimum radius of a part of a mask that is kept because its surface was not there before, pixels."""
 
 
 class MaskRefiner:
@@ -61,11 +61,11 @@ class MaskRefiner:
         self._config = config
         self._newly_occupied = newly_occupied
         self._stride = newly_occupied.stride
-        located = [track for track in tracks if track.newest.has_centroid]
-        clouds = predict_clouds(located, view.stamp, view.T_cw)
+        with_centroid = [track for track in tracks if track.newest.has_centroid]
+        clouds = predict_clouds(with_centroid, view.stamp, view.T_cw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
         projected = silhouettes(clouds, camera, spacing)
-        self._silhouettes = dict(zip(located, zip(projected, median_depths, strict=True), strict=True))
+        self._silhouettes = dict(zip(with_centroid, zip(projected, median_depths, strict=True), strict=True))
 
     @cached_property
     def _concave(self) -> NDArray[np.bool_]:
@@ -73,20 +73,20 @@ class MaskRefiner:
         return find_concave_edges(self._view.depth[0].numpy()[:: self._stride, :: self._stride])
 
     @cached_property
-    def _known(self) -> NDArray[np.bool_]:
+    def _previously_occupied(self) -> NDArray[np.bool_]:
         """Every n-th pixel whose surface was there before."""
         return self._newly_occupied.previously_occupied.numpy()
 
     @cached_property
-    def _unknown(self) -> NDArray[np.bool_]:
+    def _new_surface(self) -> NDArray[np.bool_]:
         """Every n-th pixel with depth whose surface was not there before."""
-        return ~(self._known | self._view.missing.numpy()[:: self._stride, :: self._stride])
+        return ~(self._previously_occupied | self._view.missing.numpy()[:: self._stride, :: self._stride])
 
     @cached_property
     def _growable(self) -> NDArray[np.bool_]:
         """Every n-th pixel over which a surface can grow: no edge, and not occupied before the object appeared."""
         smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
-        return smooth & ~(self._concave | self._known)
+        return smooth & ~(self._concave | self._previously_occupied)
 
     def refine(self, track: Track) -> Tensor:
         """Return the refined mask of one of the objects, bool, shape :math:`(H, W)`."""
@@ -107,35 +107,35 @@ class MaskRefiner:
         agreeing &= dilate(track.mask, config.depth_margin).numpy()
         mask |= agreeing
         mask |= track.cloud_pixels.numpy()
-        self._add_unknown_parts(track, mask)
+        self._add_new_parts(track, mask)
         return torch.from_numpy(mask)
 
-    def _add_unknown_parts(self, track: Track, mask: NDArray[np.bool_]) -> None:
+    def _add_new_parts(self, track: Track, mask: NDArray[np.bool_]) -> None:
         """Add the parts of the network's mask whose surface was not there before to the refined mask, in place.
 
         A network sometimes draws one mask over two people; the second one is not known background.
         """
-        step = self._stride
-        cells = track.mask.numpy()[::step, ::step] & ~mask[::step, ::step] & self._unknown
+        stride = self._stride
+        cells = track.mask.numpy()[::stride, ::stride] & ~mask[::stride, ::stride] & self._new_surface
         # Contours are coarse: narrow parts along them are background that was not observed before.
-        kernel = ellipse(max(_MIN_PART_RADIUS // step, 1))
+        kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
         parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
         if parts.any():
-            pixels = upsample_nearest(parts, step, mask.shape).numpy()
+            pixels = upsample_nearest(parts, stride, mask.shape).numpy()
             mask |= pixels & track.mask.numpy() & ~self._view.missing.numpy()
 
     def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
         """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (H, W)."""
         if self._config.surface_margin == 0:
             return track.cloud_pixels & reachable
-        step = self._stride
-        seeds = track.cloud_pixels.numpy()[::step, ::step]
-        near = dilate(subsample(track.mask, step), self._config.surface_margin // step).numpy()
-        near &= reachable.numpy()[::step, ::step]
+        stride = self._stride
+        seeds = track.cloud_pixels.numpy()[::stride, ::stride]
+        near = dilate(subsample(track.mask, stride), self._config.surface_margin // stride).numpy()
+        near &= reachable.numpy()[::stride, ::stride]
         near &= self._growable
         near |= seeds & ~self._concave
         return _fill_surfaces(
-            torch.from_numpy(near), track.cloud_pixels, reachable, step, self._config.min_surface_fraction
+            torch.from_numpy(near), track.cloud_pixels, reachable, stride, self._config.min_surface_fraction
         )
 
 
@@ -149,26 +149,26 @@ def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], tupl
 
 
 def _fill_surfaces_compiled(
-    region: Tensor, pixels: Tensor, reachable: Tensor, step: int, min_fraction: float
+    region: Tensor, pixels: Tensor, reachable: Tensor, stride: int, min_fraction: float
 ) -> Tensor:
     count, components, (rows, columns) = _components(region.view(torch.uint8).numpy())
-    seeds = np.ascontiguousarray(pixels.view(torch.uint8).numpy()[::step, ::step][rows, columns])
-    crop = slice(step * rows.start, step * rows.stop), slice(step * columns.start, step * columns.stop)
+    seeds = np.ascontiguousarray(pixels.view(torch.uint8).numpy()[::stride, ::stride][rows, columns])
+    crop = slice(stride * rows.start, stride * rows.stop), slice(stride * columns.start, stride * columns.stop)
     surface = np.zeros(reachable.shape, np.uint8)
     in_crop = np.ascontiguousarray(reachable.view(torch.uint8).numpy()[crop])
-    surface[crop] = kernels.fill_components(components, count, seeds, in_crop, step, min_fraction)
+    surface[crop] = kernels.fill_components(components, count, seeds, in_crop, stride, min_fraction)
     return torch.from_numpy(surface).view(torch.bool)
 
 
 @compiled_by(_fill_surfaces_compiled)
-def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int, min_fraction: float) -> Tensor:
+def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, stride: int, min_fraction: float) -> Tensor:
     """Select the surfaces of a region that belong to an object.
 
     Args:
         region: Cells of the object and of smooth surfaces near it, bool, shape :math:`(h, w)`.
         pixels: Pixels of the object, bool, shape :math:`(H, W)`.
         reachable: Pixels that can be selected, bool, shape :math:`(H, W)`.
-        step: Side of a cell, pixels.
+        stride: Side of a cell, pixels.
         min_fraction: Minimum fraction of a surface that lies on the object.
 
     Returns:
@@ -177,14 +177,14 @@ def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, step: int,
     """
     count, components, (rows, columns) = _components(region.view(torch.uint8).numpy())
     size = np.bincount(components.ravel(), minlength=count)
-    seeds = np.bincount(components[pixels.numpy()[::step, ::step][rows, columns]], minlength=count)
+    seeds = np.bincount(components[pixels.numpy()[::stride, ::stride][rows, columns]], minlength=count)
     # If the object is only a small part of a surface, it stands on the surface or leans against it.
     selected = seeds >= min_fraction * size
     selected[0] = False
     surface = torch.zeros_like(reachable)
-    crop = slice(step * rows.start, step * rows.stop), slice(step * columns.start, step * columns.stop)
+    crop = slice(stride * rows.start, stride * rows.stop), slice(stride * columns.start, stride * columns.stop)
     in_crop = reachable[crop]
     # Dilate by one cell to include the pixels between the last checked pixel and the edge.
     cells = dilate(torch.from_numpy(selected[components]), 1).numpy()
-    surface[crop] = upsample_nearest(cells, step, in_crop.shape) & in_crop
+    surface[crop] = upsample_nearest(cells, stride, in_crop.shape) & in_crop
     return surface

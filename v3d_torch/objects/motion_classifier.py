@@ -15,9 +15,9 @@ from torch import Tensor
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
-from v3d_torch.objects.free_space_check import DepthView
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
 from v3d_torch.objects.mask_propagation import propagate_instances
@@ -30,9 +30,9 @@ from v3d_torch.objects.motion_evidence import (
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
-from v3d_torch.objects.track import STAMP_TOLERANCE, Track
+from v3d_torch.objects.track import Track
 from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
-from v3d_torch.types import Instances
+from v3d_torch.types import STAMP_TOLERANCE, Instances
 
 _STATIC_FRACTION = 0.1
 """An object is at rest over a time span if less than this fraction of its pixels appeared: contours err by some
@@ -86,7 +86,7 @@ class MotionClassifier:
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
         if not view.is_motion_measured and self._last_stamp > -torch.inf:
-            self.tracker.start_guess(stamp)
+            self.tracker.start_unregistered(stamp)
         tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
         detected = [track for track in tracks if not track.missed]
         time_spans = (*config.voting.time_spans, config.chamfer.time_span)
@@ -221,7 +221,7 @@ class MotionClassifier:
         return MotionState.STATIC
 
     def _is_held_dynamic(self, track: Track, stamp: float) -> bool:
-        """Check whether an object is voted dynamic now, or was recently and in enough frames."""
+        """Check whether there is evidence of an object's motion now, or was recently and in enough frames."""
         config = self._config.static_mask
         held = (
             stamp - track.last_dynamic <= config.hold_dynamic_time

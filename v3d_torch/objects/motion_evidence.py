@@ -12,7 +12,8 @@ import torch
 
 from v3d_torch.config import ChamferConfig, FreeSpaceConfig, VotingConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView, vacated_fractions
+from v3d_torch.objects.depth_view import DepthView
+from v3d_torch.objects.free_space_check import vacated_fractions
 from v3d_torch.objects.intra_object_motion import intra_object_motion
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import Detection3D, Track

@@ -92,18 +92,18 @@ def _bin_depths(cells: NDArray[np.int64], z: NDArray[np.float32]) -> tuple[NDArr
 
 
 def _select_pixels_compiled(
-    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, step: int, include_missing: bool
+    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, stride: int, include_missing: bool
 ) -> Tensor:
     if depth.dtype != torch.float32:
         return NotImplemented
     _, height, width = depth.shape
     left, top = first.tolist()
     rows, columns = (
-        _pixels_of_cells(top, len(minima), step, height),
-        _pixels_of_cells(left, minima.shape[1], step, width),
+        _pixels_of_cells(top, len(minima), stride, height),
+        _pixels_of_cells(left, minima.shape[1], stride, width),
     )
     mask = np.zeros((height, width), np.bool_)
-    box, grid = (rows.start, rows.stop, columns.start, columns.stop), (top, left, _CELL, step)
+    box, grid = (rows.start, rows.stop, columns.start, columns.stop), (top, left, _CELL, stride)
     no_depth = _NO_DEPTH / 2 if include_missing else 0.0
     kernels.select_pixels(minima, to_array(depth[0]), box, grid, tolerance, no_depth, mask)
     return torch.from_numpy(mask)
@@ -111,7 +111,7 @@ def _select_pixels_compiled(
 
 @compiled_by(_select_pixels_compiled)
 def _select_pixels(
-    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, step: int, include_missing: bool
+    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, stride: int, include_missing: bool
 ) -> Tensor:
     """Select the pixels whose depth lies within the range of their cell.
 
@@ -120,7 +120,7 @@ def _select_pixels(
         first: First cell (column, row).
         depth: Depth of every n-th pixel, metres, shape (1, h, w); 0 = no measurement.
         tolerance: Tolerance of the depth, metres.
-        step: Step n between the pixels of ``depth``.
+        stride: Step n between the pixels of ``depth``.
         include_missing: Include pixels without depth in cells near points.
 
     Returns:
@@ -129,11 +129,11 @@ def _select_pixels(
     mask = np.zeros(depth.shape[1:], np.bool_)
     left, top = first.tolist()
     v, u = (
-        _pixels_of_cells(top, len(minima), step, depth.shape[1]),
-        _pixels_of_cells(left, minima.shape[1], step, depth.shape[2]),
+        _pixels_of_cells(top, len(minima), stride, depth.shape[1]),
+        _pixels_of_cells(left, minima.shape[1], stride, depth.shape[2]),
     )
-    cell_rows = np.arange(v.start, v.stop) * step // _CELL - top
-    cell_columns = np.arange(u.start, u.stop) * step // _CELL - left
+    cell_rows = np.arange(v.start, v.stop) * stride // _CELL - top
+    cell_columns = np.arange(u.start, u.stop) * stride // _CELL - left
     # Expand the cells to pixels: columns first, while there are few rows.
     low, high = (
         bound.take(cell_columns, axis=1).take(cell_rows, axis=0)
@@ -169,7 +169,7 @@ class Silhouette:
         self._eroded: dict[int, Minima] = {}  # by radius
 
     def mask(
-        self, depth: Tensor, margin: int, tolerance: float, *, step: int = 1, include_missing: bool = False
+        self, depth: Tensor, margin: int, tolerance: float, *, stride: int = 1, include_missing: bool = False
     ) -> Tensor:
         """Return the pixels near the points whose depth lies within the depth range of the surrounding points.
 
@@ -177,7 +177,7 @@ class Silhouette:
             depth: Depth of every n-th pixel, metres, shape :math:`(1, h, w)`; 0 = no measurement.
             margin: Distance from the outermost points up to which pixels are included, pixels.
             tolerance: Tolerance of the depth in front of and behind the surrounding points, metres.
-            step: Step n between the pixels of ``depth``.
+            stride: Step n between the pixels of ``depth``.
             include_missing: Include pixels near the points that have no depth.
 
         Returns:
@@ -189,7 +189,7 @@ class Silhouette:
         if radius not in self._eroded:
             self._eroded[radius] = self._erode(radius)
         minima = self._eroded[radius]
-        return _select_pixels(minima, self._first_cell - radius, depth, tolerance, step, include_missing)
+        return _select_pixels(minima, self._first_cell - radius, depth, tolerance, stride, include_missing)
 
     def _erode(self, radius: int) -> Minima:
         """Return the minima around each cell, also around the empty cells within the radius of the others."""
@@ -227,7 +227,7 @@ class Silhouette:
         return depth[0].numpy()[v, u]
 
 
-def _pixels_of_cells(first: int, count: int, step: int, size: int) -> slice:
+def _pixels_of_cells(first: int, count: int, stride: int, size: int) -> slice:
     """Return the range of every n-th pixel of ``count`` cells that start with the cell ``first``, along one axis."""
-    begin, end = max(-(-first * _CELL // step), 0), min(-(-(first + count) * _CELL // step), size)
+    begin, end = max(-(-first * _CELL // stride), 0), min(-(-(first + count) * _CELL // stride), size)
     return slice(begin, max(begin, end))

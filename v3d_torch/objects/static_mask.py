@@ -11,7 +11,7 @@ from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.free_space_check import DepthView
+from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_ops import dilate
 from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.newly_occupied import NewlyOccupied

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from v3d_torch.objects.free_space_check import erode_measured
+from v3d_torch.objects.depth_view import erode_measured
 
 _REACH = 3
 """Distance at which a bend is measured, cells: over a shorter distance the depth noise is larger than the bend."""
@@ -20,20 +20,20 @@ _MIN_BEND = 0.012
 length of 525 pixels, has 0.016 at any distance; the standard deviation on smoothed images of a Kinect is 0.005."""
 
 
-def find_smooth_pixels(depth: NDArray[np.float32], step: int, edge_ratio: float) -> NDArray[np.bool_]:
-    """Check at every n-th pixel whether the depth within half the step of it varies by less than ``edge_ratio``.
+def find_smooth_pixels(depth: NDArray[np.float32], stride: int, edge_ratio: float) -> NDArray[np.bool_]:
+    """Check at every n-th pixel whether the depth within half the stride of it varies by less than ``edge_ratio``.
 
     Args:
         depth: Depth, metres, shape :math:`(H, W)`; 0 = no measurement.
-        step: Step n between the pixels.
+        stride: Step n between the pixels.
         edge_ratio: Largest variation of the depth, as a fraction of the depth.
 
     Returns:
         Bool, shape :math:`(h, w)`.
     """
-    size, centre = step + 1, depth[::step, ::step]
-    nearest = erode_measured(depth, size)[::step, ::step]
-    farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::step, ::step]
+    size, centre = stride + 1, depth[::stride, ::stride]
+    nearest = erode_measured(depth, size)[::stride, ::stride]
+    farthest = cv2.dilate(depth, np.ones((size, size), np.uint8))[::stride, ::stride]
     return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)
 
 

@@ -11,11 +11,13 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.objects.association import vacancy_log_ratio
 from v3d_torch.objects.feature_shift import FeatureShift, sum_shifts
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import LIVING, RIGID, UNLABELLED
+from v3d_torch.types import STAMP_TOLERANCE
 
 _WHOLE_SIGMA = 0.05
 """Standard deviation of the centroid of a fully visible object from that of the object, metres: arms and legs swing by
@@ -37,7 +39,7 @@ _MIN_CONFIRMED_SCORE = 0.75
 """Sum of the scores of the detections from which an object is confirmed: one strong detection or some weak ones."""
 
 _CONFIRMING_DYNAMIC_FRAMES = 2
-"""Number of frames in which the vote classified an object as dynamic that confirm it, whatever its scores."""
+"""Number of frames with evidence of an object's motion that confirm it, whatever its scores."""
 
 _APPEARANCE_RATE = 0.1
 """Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
@@ -51,9 +53,6 @@ _DETECTION_TIME = 1.0
 
 _STATE_HISTORY, _HISTORY_INTERVAL = 10.0, 0.1 - 1e-3
 """Length of the history of states, and minimum time between two of them, seconds: for planners and drawings."""
-
-STAMP_TOLERANCE = 1e-3
-"""Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
 
 
 @dataclass(frozen=True, eq=False)  # compared by identity
@@ -77,8 +76,8 @@ class Detection3D:
 
     def transform(self, T_new_old: Tensor) -> Detection3D:
         """Return the detection in another world frame; ``T_new_old`` is float64, shape :math:`(4, 4)`."""
-        R, t = T_new_old[:3, :3], T_new_old[:3, 3]
-        return Detection3D(self.stamp, R @ self.centroid + t, self.cloud @ R.T.to(self.cloud) + t.to(self.cloud))
+        centroid = T_new_old[:3, :3] @ self.centroid + T_new_old[:3, 3]
+        return Detection3D(self.stamp, centroid, transform_points(T_new_old, self.cloud))
 
 
 @dataclass(eq=False)  # compared by identity, so that a track can be a dictionary key
@@ -86,8 +85,9 @@ class Track:
     """One object.
 
     The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
-    masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` and
-    ``last_deforming`` record the results of votes and Chamfer distances, ``last_shifted`` those of features.
+    masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` records
+    evidence of motion by free space, votes or features, ``last_shifted`` that of features alone, ``last_deforming``
+    that of Chamfer distances.
 
     Args:
         config: Noise and maximum speed of the Kalman filter.
@@ -111,9 +111,9 @@ class Track:
         appearance_points: Mean number of points of the views in this histogram, with the same weights.
         vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
         vacancy: Evidence of this, see `vacancy_log_ratio`.
-        dynamic_frames: Number of frames in which the vote classified the object as dynamic.
-        last_dynamic: Timestamp of the last frame in which the vote classified the object as dynamic, seconds.
-        last_deforming: Timestamp of the last frame in which the Chamfer distance exceeded the threshold, seconds.
+        dynamic_frames: Number of frames in which free space, votes or features showed a motion of the object.
+        last_dynamic: Timestamp of the last of these frames, seconds.
+        last_deforming: Timestamp of the last frame in which the object deformed, see `chamfer_evidence`, seconds.
         supported_since: Timestamp of the first frame since which its features have fitted the camera motion in every
             frame, seconds; infinity if they did not in the newest frame.
         last_shifted: Timestamp of the last frame in which its features had moved against the camera motion, seconds.
@@ -193,8 +193,8 @@ class Track:
     def predict_state(self, stamp: float) -> ObjectState:
         """Predict position and velocity of the whole object with constant velocity (paper, Sec. II).
 
-        An object whose centroid has not been measured for longer, for example because it is too far for its depth, does
-        not go on for ever, see `predict_return`.
+        Some time after the last measured centroid, for example of an object that is too far for its depth, the velocity
+        decays, see `predict_unobserved_state`.
 
         Args:
             stamp: Timestamp, seconds.
@@ -221,7 +221,7 @@ class Track:
         motion = self.predict_state(stamp).position - self.predict_state(self.newest.stamp).position
         return motion.nan_to_num(0.0)
 
-    def predict_return(self, stamp: float) -> ObjectState:
+    def predict_unobserved_state(self, stamp: float) -> ObjectState:
         """Predict the state of an object that is not observed any more, see `ObjectState.predict_with_decay`.
 
         An object that cannot move is where it was.
@@ -251,7 +251,7 @@ class Track:
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
         self.vacant_time = self.vacancy = 0.0
-        self._remember_state()
+        self._append_state()
         self.detections.append(detection)
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
@@ -278,7 +278,7 @@ class Track:
         self.detections = self.detections[-1:]
 
     def restart(self, stamp: float) -> None:
-        """Forget the detections from before the object was lost; motion is measured anew.
+        """Remove the detections from before the object was lost; motion is measured anew.
 
         Args:
             stamp: Timestamp of the first detection afterwards, seconds.
@@ -331,7 +331,7 @@ class Track:
         self.mask, self.cloud_pixels, self.coarse_mask, self.missed = mask, cloud_pixels, coarse_mask, missed
 
     def mark_dynamic(self, stamp: float) -> None:
-        """Record that the vote classified the object as dynamic in the frame at ``stamp``, seconds."""
+        """Record that the frame at ``stamp``, seconds, shows a motion of the object."""
         self.last_dynamic = stamp
         self.dynamic_frames += 1
         self.is_confirmed = self.is_confirmed or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
@@ -384,7 +384,7 @@ class Track:
     def _predict_stop(self, state: ObjectState, stamp: float) -> ObjectState:
         return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
 
-    def _remember_state(self) -> None:
+    def _append_state(self) -> None:
         """Append the state to the history, at the rate of the history, and drop the states that are too old."""
         state = self._filter.visible_state
         if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
@@ -409,4 +409,4 @@ def predict_clouds(tracks: Sequence[Track], stamp: float, T_cw: Tensor) -> list[
     counts = [len(cloud) for cloud in clouds]
     motions = torch.stack([track.predict_motion(stamp) for track in tracks])
     points = torch.cat(clouds).to(torch.float64) + motions.repeat_interleave(torch.tensor(counts), dim=0)
-    return list((points @ T_cw[:3, :3].T + T_cw[:3, 3]).split(counts))
+    return list(transform_points(T_cw, points).split(counts))

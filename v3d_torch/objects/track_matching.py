@@ -100,11 +100,10 @@ def detect_instances(
         T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
         stride: Step between the coarse pixels, pixels.
     """
-    R, t = T_wc[:3, :3], T_wc[:3, 3]
-    detections = []
-    for points, valid, centroid in zip(clouds.points, clouds.valid, clouds.centroid, strict=True):
-        cloud = points[valid]
-        detections.append(Detection3D(stamp, R @ centroid.to(R) + t, cloud @ R.T.to(cloud) + t.to(cloud)))
+    detections = [
+        Detection3D(stamp, centroid.to(torch.float64), points[valid]).transform(T_wc)
+        for points, valid, centroid in zip(clouds.points, clouds.valid, clouds.centroid, strict=True)
+    ]
     return DetectedInstances(
         stamp,
         instances.labels,
@@ -137,7 +136,7 @@ def predict_tracks(
     projected = silhouettes(predict_clouds(tracks, stamp, T_cw), camera, config.voxel_size)
     coarse_depth = subsample(depth, stride)
     masks = [
-        predict_mask(track, each, coarse_depth, config.max_depth, step=stride)
+        predict_mask(track, each, coarse_depth, config.max_depth, stride=stride)
         for track, each in zip(tracks, projected, strict=True)
     ]
     return PredictedTracks(
@@ -205,7 +204,7 @@ def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, 
         Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
     """
     same_class = _same_class(tracks, detected)
-    states = [track.predict_return(detected.stamp) for track in tracks]
+    states = [track.predict_unobserved_state(detected.stamp) for track in tracks]
     possible = same_class & _within_gate(tracks, states, detected, config)
     evidence = (
         _position_evidence(tracks, states, detected, possible)
@@ -237,7 +236,7 @@ def _appearance_evidence(
     unknown = torch.full_like(detected.appearance[0], torch.nan)
     appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
     similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
-    elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
+    elapsed = _elapsed(tracks, detected)
     tracked = torch.tensor(tracked_points, dtype=torch.float64)[:, None]
     points = torch.tensor([len(detection.cloud) for detection in detected.detections], dtype=torch.float64)
     return appearance_log_ratio(similarity, elapsed, torch.minimum(tracked, points), torch.maximum(tracked, points))
@@ -253,8 +252,12 @@ def _within_gate(
     """Mask of the pairs whose distance is within the maximum motion of the track, bool, shape (T, N)."""
     predicted = torch.stack([state.position for state in states])
     observed = torch.stack([detection.centroid for detection in detected.detections])
-    elapsed = torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
-    return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * elapsed
+    return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * _elapsed(tracks, detected)
+
+
+def _elapsed(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
+    """Time since the last detection of each track, seconds, float64, shape (T, 1)."""
+    return torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
 
 
 def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:

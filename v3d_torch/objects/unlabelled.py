@@ -36,7 +36,7 @@ def unlabelled_instances(
 
     Args:
         newly_occupied: Newly occupied pixels of the frame.
-        instances: Instances of the frame from the segmentation.
+        instances: Instances of the frame, from the segmenter or propagated from the previous frame.
         depth: Depth of the frame, metres, shape :math:`(1, H, W)`.
         camera: Camera of the frame.
         min_area: Minimum area of a region, square metres; smaller regions are noise.
@@ -44,19 +44,19 @@ def unlabelled_instances(
     Returns:
         Instances of class `UNLABELLED` with score 0 and empty boxes; none if nothing is newly occupied.
     """
-    step, (height, width) = newly_occupied.stride, depth.shape[-2:]
+    stride, (height, width) = newly_occupied.stride, depth.shape[-2:]
     appeared = (newly_occupied.appeared == 1).any(dim=0).to(torch.uint8).numpy()
     appeared = cv2.morphologyEx(appeared, cv2.MORPH_OPEN, _OPENING_KERNEL)
-    coarse_masks = subsample(instances.masks, step)
+    coarse_masks = subsample(instances.masks, stride)
     explained = _explained_pixels(instances.labels, coarse_masks, torch.from_numpy(appeared > 0))
     appeared[cv2.dilate(explained.to(torch.uint8).numpy(), _RIM_KERNEL) > 0] = 0
     count, region = cv2.connectedComponents(appeared)
-    pixel_area = np.square(depth[0, ::step, ::step].to(torch.float64).numpy() * step) / (camera.fx * camera.fy)
+    pixel_area = np.square(depth[0, ::stride, ::stride].to(torch.float64).numpy() * stride) / (camera.fx * camera.fy)
     area = np.bincount(region.ravel(), weights=pixel_area.ravel(), minlength=count)
     large = 1 + np.flatnonzero(area[1:] >= min_area)
     if len(large) == 0:
         return Instances.empty(height, width)
-    masks = upsample_nearest(region == large[:, None, None], step, (height, width))
+    masks = upsample_nearest(region == large[:, None, None], stride, (height, width))
     return Instances.from_masks(masks, torch.full((len(large),), UNLABELLED))
 
 

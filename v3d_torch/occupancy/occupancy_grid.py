@@ -56,9 +56,9 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
         raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest")
     T_lw, low, high = level_frame(floor.up), low + floor.offset, high + floor.offset
     occupied = torch.cat(
-        [_between(points, T_lw, low, high) for points in occupancy.points_by_part(VoxelState.OCCUPIED)]
+        [_between(points, T_lw, low, high) for points in occupancy.points_by_chunk(VoxelState.OCCUPIED)]
     )
-    free = [_extent(_between(points, T_lw, low, high)) for points in occupancy.points_by_part(VoxelState.FREE)]
+    free = [_extent(_between(points, T_lw, low, high)) for points in occupancy.points_by_chunk(VoxelState.FREE)]
     known = torch.cat([occupied, *free])
     if len(known) == 0:
         return OccupancyGrid(torch.zeros(0, 0, dtype=torch.int8), size, (0.0, 0.0), T_lw, floor.offset)

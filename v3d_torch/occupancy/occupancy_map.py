@@ -60,25 +60,25 @@ class OccupancyMap:
     @property
     def occupied_points(self) -> Tensor:
         """Centres of the occupied voxels, metres, float64, shape :math:`(N, 3)`."""
-        return torch.cat(list(self.points_by_part(VoxelState.OCCUPIED)))
+        return torch.cat(list(self.points_by_chunk(VoxelState.OCCUPIED)))
 
     @property
     def free_points(self) -> Tensor:
         """Centres of the free voxels, metres, float64, shape :math:`(N, 3)`."""
-        return torch.cat(list(self.points_by_part(VoxelState.FREE)))
+        return torch.cat(list(self.points_by_chunk(VoxelState.FREE)))
 
-    def points_by_part(self, state: VoxelState) -> Iterator[Tensor]:
-        """Yield the centres of the occupied or free voxels, one part of the map at a time, to save memory.
+    def points_by_chunk(self, state: VoxelState) -> Iterator[Tensor]:
+        """Yield the centres of the occupied or free voxels, one chunk of the map at a time, to save memory.
 
         Args:
             state: State of the voxels, not unknown.
 
         Returns:
-            Centres, metres, float64, shape :math:`(N, 3)`, of each part; at least one tensor.
+            Centres, metres, float64, shape :math:`(N, 3)`, of each chunk; at least one tensor.
         """
-        for part in self.blocks.parts():
-            known, is_occupied = part.log_odds != UNKNOWN, part.log_odds >= 0
-            voxels = part.voxels_where(is_occupied if state == VoxelState.OCCUPIED else known & ~is_occupied)
+        for chunk in self.blocks.chunks():
+            known, is_occupied = chunk.log_odds != UNKNOWN, chunk.log_odds >= 0
+            voxels = chunk.voxels_where(is_occupied if state == VoxelState.OCCUPIED else known & ~is_occupied)
             yield (voxels.to(torch.float64) + 0.5) * self.config.voxel_size
 
     def integrate(self, depth: Tensor, static: Tensor, rays: Tensor, T_wc: Tensor) -> None:

@@ -164,7 +164,7 @@ class OccupancyMapper:
         self._rebuilt_views = end
         if end == len(self._store):
             if self._store.has_removed_far:  # what only removed views have seen stays as it was
-                self._rebuilt.blocks.adopt_better_known(self.map.blocks)
+                self._rebuilt.blocks.copy_better_observed(self.map.blocks)
             self.map.replace_blocks(self._rebuilt.blocks)
             self._rebuilt, self._rebuilt_views = None, 0
 

@@ -43,15 +43,15 @@ def write_octomap(path: StrPath, occupancy: OccupancyMap) -> None:
         OutputError: If the file cannot be written, or the map is larger than OctoMap's trees.
     """
     path, tree, blocks = Path(path), _InnerNodes(), []
-    for part in occupancy.blocks.parts():
-        known = part.log_odds != UNKNOWN
-        voxels = part.voxels_where(known)
+    for chunk in occupancy.blocks.chunks():
+        known = chunk.log_odds != UNKNOWN
+        voxels = chunk.voxels_where(known)
         if len(voxels) and int(torch.maximum(voxels, -voxels - 1).max()) >= _HALF:
             extent = _HALF * occupancy.config.voxel_size
             raise OutputError(
                 f"{path}: the map is larger than an OctoMap of {extent:.0f} m in each direction; use larger voxels"
             )
-        states = torch.where(part.log_odds[known] >= 0, _OCCUPIED, _FREE).numpy().astype(np.uint64)
+        states = torch.where(chunk.log_odds[known] >= 0, _OCCUPIED, _FREE).numpy().astype(np.uint64)
         blocks.append(tree.add_leaves(_morton_codes(voxels.numpy()), states))
     codes, states = (np.concatenate(values) for values in zip(*blocks, strict=True))
     tree.add_parents(codes, states, range(BITS + 1, _DEPTH + 1))

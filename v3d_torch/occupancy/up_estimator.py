@@ -13,7 +13,7 @@ from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 
 
 class UpEstimator:
-    """Collects what frames tell about the up direction: measured gravity, and votes of the segmentation.
+    """Collects the measurements of the up direction: measured gravity, and votes of the segmentation.
 
     Attributes:
         gravity: First measured direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`;

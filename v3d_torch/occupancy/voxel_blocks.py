@@ -19,8 +19,8 @@ from v3d_torch.kernels.voxel_blocks import BITS, HIT, SIDE, UNKNOWN, VOLUME
 from v3d_torch.occupancy.ray_casting import Observations, index_in_block
 from v3d_torch.occupancy.sensor_model import SensorModel
 
-_PART = 256
-"""Maximum number of blocks of a part: a million voxels, whose coordinates need 100 MB with intermediate results."""
+_CHUNK_BLOCKS = 256
+"""Maximum number of blocks of a chunk: a million voxels, whose coordinates need 100 MB with intermediate results."""
 
 
 class VoxelBlocks:
@@ -56,11 +56,11 @@ class VoxelBlocks:
             observations: Voxels that the view observes.
             model: Log-odds of hits and misses.
         """
-        slots = self.find(observations.blocks)
-        if bool((missing := slots < 0).any()):
+        rows = self.find(observations.blocks)
+        if bool((missing := rows < 0).any()):
             self._append(observations.blocks[missing])
-            slots = self.find(observations.blocks)
-        add_observations(self._log_odds, slots, observations.marks, model)
+            rows = self.find(observations.blocks)
+        add_observations(self._log_odds, rows, observations.marks, model)
 
     def find(self, blocks: Tensor) -> Tensor:
         """Find the rows of blocks.
@@ -89,9 +89,9 @@ class VoxelBlocks:
         """
         if len(self) == 0:
             return torch.full((len(voxels),), UNKNOWN, dtype=torch.int8)
-        slots = self.find(voxels >> BITS)
-        found = self.log_odds.flatten()[slots.clamp(min=0) * VOLUME + index_in_block(voxels)]
-        return torch.where(slots >= 0, found, UNKNOWN)
+        rows = self.find(voxels >> BITS)
+        found = self.log_odds.flatten()[rows.clamp(min=0) * VOLUME + index_in_block(voxels)]
+        return torch.where(rows >= 0, found, UNKNOWN)
 
     def keep(self, mask: Tensor) -> None:
         """Remove all blocks except those in a bool mask; the others keep their order."""
@@ -99,26 +99,26 @@ class VoxelBlocks:
 
     def count_known(self) -> Tensor:
         """Number of voxels of each block that were observed, int64, shape :math:`(N,)`."""
-        return torch.cat([(part.log_odds != UNKNOWN).sum(dim=1) for part in self.parts()])
+        return torch.cat([(chunk.log_odds != UNKNOWN).sum(dim=1) for chunk in self.chunks()])
 
-    def adopt_better_known(self, other: VoxelBlocks) -> None:
-        """Take blocks from another grid: those that only it has, and those of which it knows twice as many voxels."""
+    def copy_better_observed(self, other: VoxelBlocks) -> None:
+        """Copy blocks of another grid: those that this grid lacks, and those with twice as many observed voxels."""
         missing = self.find(other.coordinates) < 0
         if bool(missing.any()):
             self._append(other.coordinates[missing])
-        slots = self.find(other.coordinates)
-        better = other.count_known() >= 2 * self.count_known()[slots]
-        self._log_odds[slots[better]] = other.log_odds[better]
+        rows = self.find(other.coordinates)
+        better = other.count_known() >= 2 * self.count_known()[rows]
+        self._log_odds[rows[better]] = other.log_odds[better]
 
-    def parts(self) -> Iterator[VoxelBlocks]:
-        """Yield parts with some of the blocks each, in their order, so that work on all voxels needs little memory.
+    def chunks(self) -> Iterator[VoxelBlocks]:
+        """Yield chunks with some of the blocks each, in their order, so that work on all voxels needs little memory.
 
-        There is at least one part. Parts share the memory of the blocks and are only read.
+        There is at least one chunk. Chunks share the memory of the blocks and are only read.
         """
-        for first in range(0, max(len(self), 1), _PART):
-            rows, part = slice(first, first + _PART), VoxelBlocks()
-            part.load_state_dict({"coordinates": self.coordinates[rows], "log_odds": self.log_odds[rows]})
-            yield part
+        for first in range(0, max(len(self), 1), _CHUNK_BLOCKS):
+            rows, chunk = slice(first, first + _CHUNK_BLOCKS), VoxelBlocks()
+            chunk.load_state_dict({"coordinates": self.coordinates[rows], "log_odds": self.log_odds[rows]})
+            yield chunk
 
     def voxels_where(self, mask: Tensor) -> Tensor:
         """Coordinates of voxels.
@@ -156,22 +156,22 @@ class VoxelBlocks:
         self.keys, self.rows = cell_keys(self.coordinates).sort()
 
 
-def _add_compiled(log_odds: Tensor, slots: Tensor, marks: Tensor, model: SensorModel) -> None:
+def _add_compiled(log_odds: Tensor, rows: Tensor, marks: Tensor, model: SensorModel) -> None:
     limits = model.hit, model.miss, model.minimum, model.maximum
-    kernels.add_observations(log_odds.numpy(), slots.numpy(), marks.numpy(), *limits)
+    kernels.add_observations(log_odds.numpy(), rows.numpy(), marks.numpy(), *limits)
 
 
 @compiled_by(_add_compiled)
-def add_observations(log_odds: Tensor, slots: Tensor, marks: Tensor, model: SensorModel) -> None:
+def add_observations(log_odds: Tensor, rows: Tensor, marks: Tensor, model: SensorModel) -> None:
     r"""Add the log-odds of hits and misses in place: :math:`L \leftarrow \min(\max(L + l, l_{min}), l_{max})`.
 
     Args:
         log_odds: Log-odds of all blocks, steps, int8, shape :math:`(N, 4096)`; changed in place.
-        slots: Row of each observed block, int64, shape :math:`(B,)`; no two are equal.
+        rows: Row of each observed block, int64, shape :math:`(B,)`; no two are equal.
         marks: Observations, see `Observations`, uint8, shape :math:`(B, 4096)`.
         model: Log-odds of hits and misses.
     """
-    before = log_odds[slots].to(torch.int64)
+    before = log_odds[rows].to(torch.int64)
     change = torch.where(marks == HIT, model.hit, model.miss)
     after = (torch.where(before == UNKNOWN, 0, before) + change).clamp(model.minimum, model.maximum)
-    log_odds[slots] = torch.where(marks > 0, after, before).to(torch.int8)
+    log_odds[rows] = torch.where(marks > 0, after, before).to(torch.int8)

@@ -10,9 +10,9 @@ from torch.nn.functional import grid_sample
 
 from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.long_products import sum_products
-from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.geometry.se3 import se3_exp, transform_points
 from v3d_torch.odometry.dense_view import Level
-from v3d_torch.optim.levenberg_marquardt import student_t, student_t_scale
+from v3d_torch.optim.levenberg_marquardt import REGULARISATION, student_t, student_t_scale
 
 State = tuple[Tensor, Tensor]  # T_ba (4, 4); gain and bias from the reference's brightness to the current one's (2,)
 System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba @ exp(xi), gain, bias
@@ -20,9 +20,6 @@ System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba
 _DAMPING_SCALE = 1e3
 """Factor of the damping of Levenberg-Marquardt. The Jacobian of the reference only approximates that of the current
 view; with less damping, the step after a rejected step is rejected, too."""
-
-_REGULARISATION = 1e-9
-"""Number added to the diagonal of the normal equations, which are singular without valid residuals."""
 
 _OCCLUSION_RATIO = 0.1
 """Maximum relative difference between the inverse depth in the current view and the expected one. Beyond it a point is
@@ -99,7 +96,7 @@ class AlignmentProblem:
         """Compare the reference points with the current view."""
         T_ba, (gain, bias) = state[0].to(torch.float32), state[1].to(torch.float32)
         camera = self._current.level_camera.camera
-        points = self.reference.points @ T_ba[:3, :3].T + T_ba[:3, 3]
+        points = transform_points(T_ba, self.reference.points)
         in_front = points[:, 2] > _MIN_DEPTH
         pixels = camera.distort(camera.project(points.where(in_front[:, None], 1.0))).to(torch.float32)
         last = torch.tensor([camera.width - 1, camera.height - 1], device=pixels.device)
@@ -151,6 +148,6 @@ class AlignmentProblem:
 def step(state: State, system: System, damping: Tensor) -> State:
     """State after a damped Gauss-Newton step."""
     H, gradient = system
-    diagonal = _DAMPING_SCALE * damping * H.diagonal() + _REGULARISATION
+    diagonal = _DAMPING_SCALE * damping * H.diagonal() + REGULARISATION
     change = -torch.linalg.solve(H + diagonal.diag(), gradient)
     return state[0] @ se3_exp(change[:6]), state[1] + change[6:]

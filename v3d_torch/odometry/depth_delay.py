@@ -68,7 +68,8 @@ class DepthDelayCompensation:
             depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
-            delay: Depth stamp minus colour stamp, seconds.
+            delay: Time of the depth image minus time of the colour image, seconds, including the delay that the camera
+                adds to the difference of their timestamps.
 
         Returns:
             The features with the new depth; the same object if there is no delay or compensation is disabled.

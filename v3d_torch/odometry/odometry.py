@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.odometry.dense_aligner import DenseAligner
 from v3d_torch.odometry.dense_view import DenseView
 from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion, no_pairs
@@ -77,7 +78,7 @@ class CameraMotion:
         if previous is not None and len(self.matches):
             before, now = self.matches.unbind(dim=1)
             points = camera.back_project(previous.features.uv[before], previous.features.depth[before])
-            expected = camera.project(points @ self.T_cp[:3, :3].T + self.T_cp[:3, 3])
+            expected = camera.project(transform_points(self.T_cp, points))
             residuals[now] = features.uv[now] - expected
         return residuals
 

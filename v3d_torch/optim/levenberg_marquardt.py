@@ -27,6 +27,10 @@ _DAMPING_FACTOR = 10
 DAMPING_SCHEDULE = (_INITIAL_DAMPING, _MIN_DAMPING, _MAX_DAMPING, float(_DAMPING_FACTOR))
 """The constants above, as arguments of kernels."""
 
+REGULARISATION = 1e-9
+"""Number added to the diagonal of normal equations, so that they have a solution without measurements, and for a pose
+without edges; negligible compared with the information of a measurement."""
+
 POSE_TOLERANCE = 1e-3
 """Relative change of the cost at convergence if one pose is estimated. Convergence is quadratic, so the next step would
 change far less."""

@@ -21,7 +21,14 @@ from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
 from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
-from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, POSE_TOLERANCE, huber, levenberg_marquardt, select
+from v3d_torch.optim.levenberg_marquardt import (
+    DAMPING_SCHEDULE,
+    POSE_TOLERANCE,
+    REGULARISATION,
+    huber,
+    levenberg_marquardt,
+    select,
+)
 from v3d_torch.optim.reprojection import (
     INVERSE_DEPTH_SIGMA,
     MIN_DEPTH,
@@ -33,9 +40,6 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
-
-_REGULARISATION = 1e-9
-"""Number added to the diagonal of the normal equations, which are singular without measurements."""
 
 
 class PoseRefinement(NamedTuple):
@@ -99,7 +103,7 @@ class _Problem(NamedTuple):
 
     def step(self, at: _Residuals, weights: Tensor, damping: Tensor) -> _Residuals:
         H, gradient = self.normal_equations(at, weights)
-        damped = H + torch.diag_embed(H.diagonal(dim1=-2, dim2=-1) * damping[..., None] + _REGULARISATION)
+        damped = H + torch.diag_embed(H.diagonal(dim1=-2, dim2=-1) * damping[..., None] + REGULARISATION)
         return self.residuals_at(se3_exp(-torch.linalg.solve(damped, gradient)) @ at.T_cw)
 
     def differentiate(self, T_cw: Tensor, active: Tensor, *, robust: bool) -> Tensor:
@@ -111,7 +115,7 @@ class _Problem(NamedTuple):
 
         zero = T_cw.new_zeros(*T_cw.shape[:-2], 6)
         H = jacobian(partial(gradient, problem=self.detach()), zero)
-        H = H + _REGULARISATION * torch.eye(6, dtype=H.dtype, device=H.device)
+        H = H + REGULARISATION * torch.eye(6, dtype=H.dtype, device=H.device)
         step = -torch.linalg.solve(H, gradient(zero, self))
         return se3_exp(zero_with_gradient(step)) @ T_cw
 
@@ -253,7 +257,7 @@ def _cast(refined: PoseRefinement, dtype: torch.dtype) -> PoseRefinement:
 def _minimise_compiled(
     T_cw: Tensor, *problem: Tensor, rounds: int, iterations: int, tolerance: float
 ) -> tuple[PoseRefinement, Tensor]:
-    batch, settings = T_cw.shape[:-2], (rounds, iterations, tolerance, _REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE)
+    batch, settings = T_cw.shape[:-2], (rounds, iterations, tolerance, REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE)
     arguments: tuple[Any, ...] = (*(to_rows(column, batch) for column in (T_cw, *problem)), *settings)
     results = kernels.refine_poses(*arguments)
     T, inliers, active, chi2, H = (torch.from_numpy(each).reshape(*batch, *each.shape[1:]) for each in results)

@@ -97,9 +97,9 @@ class ObjectTable(TensorTable):
     """Objects of all frames, one row per frame and object.
 
     The columns are the index and timestamp of the frame, and id, COCO class, centroid and velocity (world frame, metres
-    and seconds) with the standard deviation of each coordinate, upright box (centre, size, yaw), votes, Chamfer
-    distance, position of the motion state in `MotionState`, and true if the network missed the object. Centroid,
-    velocity, standard deviations and box are NaN until the object has a centroid.
+    and seconds) with the standard deviation of each coordinate, upright box (centre, size, yaw), votes, change of shape
+    (``chamfer`` of `TrackedObject`), position of the motion state in `MotionState`, and true if the network missed the
+    object. Centroid, velocity, standard deviations and box are NaN until the object has a centroid.
     """
 
     def __init__(self) -> None:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from v3d_torch.config import DenseMapConfig
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.reconstruction.tsdf import BLOCK, integrate, surface_blocks
 
@@ -148,7 +149,7 @@ def _observe(
 
     The weight is the inverse squared depth, and 0 where the view observes another surface, or this one from behind.
     """
-    in_camera = points @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]
+    in_camera = transform_points(view.T_cw, points)
     pixels, inside = views.camera.project_to_image(in_camera, config.mesh.voxel_size)
     u, v = pixels.round().to(torch.int64).unbind(dim=1)
     u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)

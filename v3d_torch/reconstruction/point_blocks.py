@@ -8,7 +8,7 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.voxel import voxel_pool
-from v3d_torch.objects.free_space_check import SpaceView
+from v3d_torch.objects.depth_view import SpaceView
 
 _BLOCK_SIZE = 0.5
 """Side of a block, metres: small against the frustum of a view, and large against the distance of the points."""

@@ -12,9 +12,11 @@ from v3d_torch.config import Config, FreeSpaceConfig
 from v3d_torch.geometry.camera import back_project
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.normals import surface_normals
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.geometry.voxel import Voxels, voxel_pool
 from v3d_torch.mapping.static_views import StaticView, StaticViews
-from v3d_torch.objects.free_space_check import DepthView, is_free_space
+from v3d_torch.objects.depth_view import DepthView
+from v3d_torch.objects.free_space_check import is_free_space
 from v3d_torch.reconstruction.point_blocks import PointBlocks
 
 _MIN_FREE_VIEWS = 3
@@ -81,9 +83,9 @@ def _point_rows(view: StaticView, views: StaticViews, config: Config) -> Tensor:
     normals = surface_normals(back_project(smooth, views.rays))[0]
     keep = (normals != 0).any(dim=-1) & (depth[0, 0] <= config.dense_map.max_depth)
     points = back_project(depth, views.rays)[0][keep].to(torch.float64)
-    R_wc, t_wc = view.T_wc[:3, :3], view.T_wc[:3, 3]
+    normals_w = normals[keep].to(torch.float64) @ view.T_wc[:3, :3].T
     colours = view.colour.permute(1, 2, 0)[keep].to(torch.float64)
-    return torch.cat([points @ R_wc.T + t_wc, colours, normals[keep].to(torch.float64) @ R_wc.T], dim=1)
+    return torch.cat([transform_points(view.T_wc, points), colours, normals_w], dim=1)
 
 
 def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ from torch import Tensor
 from v3d_torch.config import DenseMapConfig
 from v3d_torch.geometry.camera import back_project
 from v3d_torch.geometry.cell_keys import cell_keys, cells_of_keys
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 
 BLOCK = 8
@@ -39,7 +40,7 @@ def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
         valid = (depth > 0) & (depth <= config.max_depth)
         points = back_project(depth[None, None], views.rays)[0][valid].to(torch.float64)
         offset = config.mesh.truncation * points / points.norm(dim=1, keepdim=True)
-        points = torch.cat([points - offset, points, points + offset]) @ view.T_wc[:3, :3].T + view.T_wc[:3, 3]
+        points = transform_points(view.T_wc, torch.cat([points - offset, points, points + offset]))
         blocks = (points / (BLOCK * config.mesh.voxel_size)).floor().to(torch.int64)
         found.append(cell_keys(blocks).unique())
     return cells_of_keys(torch.cat(found).unique())
@@ -80,7 +81,7 @@ def _blocks_in_view(corners: Tensor, view: StaticView, views: StaticViews, confi
     """Rows of the blocks, given by their first corners, whose bounding spheres intersect the viewing frustum."""
     side = (BLOCK - 1) * config.mesh.voxel_size
     radius = 0.5 * 3**0.5 * side
-    x, y, z = ((corners + 0.5 * side) @ view.T_cw[:3, :3].T + view.T_cw[:3, 3]).unbind(dim=1)
+    x, y, z = transform_points(view.T_cw, corners + 0.5 * side).unbind(dim=1)
     camera = views.camera
     inside = z > -radius
     for position, focal, first, last in (

@@ -14,8 +14,8 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.keyframe import Keyframe, Loop
+from v3d_torch.objects.depth_view import StoredView
 from v3d_torch.objects.feature_shift import FeatureShift
-from v3d_torch.objects.free_space_check import StoredView
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.track import Detection3D, Track

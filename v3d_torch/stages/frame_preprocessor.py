@@ -90,8 +90,8 @@ class FramePreprocessor(ReplaceableStages):
 
         Args:
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
-            prediction: Pose prediction made `PREFETCHED_FRAMES` frames before, from which the segmenter computes the
-                roll of the camera; None if the pose is not known.
+            prediction: Pose prediction after an earlier frame, from which the segmenter computes the roll of the
+                camera; None if the pose is not known.
             is_due: False to skip the frame; None to segment only every ``segmentation.interval``-th frame.
 
         Raises:

@@ -53,9 +53,11 @@ class CompensationStage(Protocol):
         """Move features to where a global shutter would observe them, with their depth at that time.
 
         Args:
-            features: Features as observed.
+            features: Features as observed, or compensated with the same readout and another velocity: the result must
+                be the same.
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
+            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds; the
+                camera's own delay, `PinholeCamera.depth_delay`, is to be added.
             velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
             readout: Readout of the camera.
@@ -85,11 +87,11 @@ class ProposalStage(Protocol):
     """Proposal of moving regions without a class, such as `unlabelled_instances`; attribute ``propose_unlabelled``."""
 
     def __call__(self, newly_occupied: NewlyOccupied, instances: Instances, depth: Tensor, /) -> Instances:
-        """Propose instances that the segmenter has not found.
+        """Propose regions that move and that no given instance contains.
 
         Args:
             newly_occupied: Newly occupied pixels of the frame.
-            instances: Instances of the segmenter.
+            instances: Instances of the frame, from the segmenter or propagated from the previous frame.
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
 
         Returns:

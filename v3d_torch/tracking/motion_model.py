@@ -48,7 +48,7 @@ class PosePrediction:
 
 
 class MotionModel:
-    """Estimates the velocity of the camera from the poses of its frames.
+    """Estimates how static points move in the camera frame, from the poses of the frames.
 
     Attributes:
         velocity: Twist of static points in the camera frame after the last frame, as in `PosePrediction`.

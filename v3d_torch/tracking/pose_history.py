@@ -22,7 +22,8 @@ class PoseHistory:
 
     Attributes:
         last_localised: Time of the last frame that was found, seconds; minus infinity if there is none.
-        observed_landmarks: IDs of the landmarks observed by the last frame that was found, int64, shape :math:`(L,)`.
+        observed_landmarks: IDs of the landmarks that the last frame observed that observed any, int64, shape
+            :math:`(L,)`.
     """
 
     def __init__(self) -> None:
@@ -36,7 +37,7 @@ class PoseHistory:
         self._keyframes: dict[int, Keyframe] = {}  # to which poses are relative, by index
         self.last_localised = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
-        self._place: Keyframe | None = None  # nearest to the last frame that was found
+        self._place: Keyframe | None = None  # to which the last frame that observed landmarks is relative
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -115,7 +116,7 @@ class PoseHistory:
         status, is_found = _status(pose, keyframe, is_new=new is not None), pose.status is not TrackingStatus.LOST
         T_new_old = None
         if self.status is TrackingStatus.LOST and status is not TrackingStatus.LOST:
-            correction = torch.eye(4, dtype=torch.float64)  # a lost camera starts a part of the map where it is
+            correction = torch.eye(4, dtype=torch.float64)  # a new part of the map starts at the predicted pose
             if is_found:
                 correction = orthonormalise(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
             first = is_found and not self.is_localised

@@ -17,7 +17,7 @@ PATH_COLOURS = {"odometry": "#ff7f0e", "disconnected": "#d62728", "lost": "#d627
 """Colour of frames that are not tracked, and of keyframes of an earlier run. The colour of tracked frames changes from
 dark blue to yellow with time."""
 
-_FRUSTUM_DEPTH = 0.08
+FRUSTUM_DEPTH = 0.08
 """Distance from the camera centre to the drawn image plane, metres: visible but not dominant at the size of a room."""
 
 # Vertices of a frustum: 0 is the camera centre, 1-4 are the image corners clockwise, 5 is a mark above the image.
@@ -56,7 +56,7 @@ def make_camera_path(
     """
     right, bottom = camera.width - 0.5, camera.height - 0.5
     corners = torch.tensor([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [right / 2, -0.15 * bottom]])
-    image = camera.back_project(corners.to(torch.float64), torch.full((5,), _FRUSTUM_DEPTH, dtype=torch.float64))
+    image = camera.back_project(corners.to(torch.float64), torch.full((5,), FRUSTUM_DEPTH, dtype=torch.float64))
     frustum = torch.cat([image.new_zeros(1, 3), image])
     frustums = frustum @ T_wk[:, :3, :3].mT + T_wk[:, None, :3, 3]
     first_vertex = len(trajectory) + len(frustum) * torch.arange(len(T_wk))[:, None, None]

@@ -33,7 +33,7 @@ class ObjectRow:
         name: Name of the object's class.
         motion_state: One of `MOTION_STATE_COLOURS`.
         votes: Number of votes for the object.
-        chamfer: Chamfer distance, metres; NaN if it was not measured.
+        chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured.
     """
 
     stamp: float
@@ -131,7 +131,7 @@ def _draw_chamfer(
 ) -> None:
     vmax = float(np.nanquantile(grid, _CHAMFER_QUANTILE))
     _draw_scale(axes, seconds, grid, vmin=0.0, vmax=vmax, integer=False)
-    title = "Chamfer distance to the object's earlier cloud [m]"
+    title = "Root-mean-square (Chamfer) distance to the object's earlier cloud [m]"
     if chamfer_threshold is not None:
         title += f"; threshold {chamfer_threshold:g} m, and the free-space check has to agree"
     axes.set_title(title, loc="left", fontsize="small")

@@ -16,6 +16,7 @@ from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors
 from v3d_torch.evaluation.rpe import motion_errors
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.time_axes import frame_cells, make_time_axes
 from v3d_torch.viz.time_gaps import insert_gaps
@@ -37,8 +38,7 @@ def draw_positions(groundtruth: Trajectory | None, estimate: Trajectory, evaluat
     positions = estimate.T_wc[:, :3, 3]
     figure, panels = make_time_axes((estimate.stamps - start).tolist(), [1.1] * 3, extra_height=0.2)
     if evaluation is not None and groundtruth is not None:
-        T_ge = evaluation.alignment.T_ge
-        positions = positions @ T_ge[:3, :3].mT + T_ge[:3, 3]
+        positions = transform_points(evaluation.alignment.T_ge, positions)
         truth = within(groundtruth, estimate)
         _plot_positions(panels, truth.stamps - start, truth.T_wc[:, :3, 3], "black", "ground truth")
     _plot_positions(panels, estimate.stamps - start, positions, "tab:blue", "estimate")

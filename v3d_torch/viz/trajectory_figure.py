@@ -16,6 +16,7 @@ from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_traj
 from v3d_torch.evaluation.ate import absolute_errors, align
 from v3d_torch.evaluation.evaluation import MIN_PAIRS, has_orientations
 from v3d_torch.evaluation.statistics import Statistics
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.fonts import draw_title
@@ -76,7 +77,7 @@ def draw_trajectory(
         T_gc, T_ec = groundtruth.T_wc[matches.groundtruth], estimate.T_wc[matches.estimate]
         alignment = align(T_gc, T_ec, oriented=has_orientations(groundtruth))
         truth = within(groundtruth, estimate)
-        aligned = p_e @ alignment.T_ge[:3, :3].mT + alignment.T_ge[:3, 3]
+        aligned = transform_points(alignment.T_ge, p_e)
         segments = torch.stack([T_gc[:, :3, 3], aligned[matches.estimate]], dim=1)
         error = Statistics.of(absolute_errors(T_gc, T_ec, alignment)).rmse
         curves = [

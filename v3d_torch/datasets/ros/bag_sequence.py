@@ -23,6 +23,7 @@ from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
 from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.depth_scale import MILLIMETRES
 from v3d_torch.io.download import Progress
 from v3d_torch.io.text import first_line
 from v3d_torch.io.timestamps import associate
@@ -30,9 +31,6 @@ from v3d_torch.io.timestamps import associate
 if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader as Reader1
     from rosbags.rosbag2 import Reader as Reader2
-
-_DEPTH_SCALE = 1000.0
-"""Units per metre of 16-bit depth: ROS stores millimetres (REP 118)."""
 
 _REPAIR_COMMANDS = {".bag": "rosbag reindex", ".mcap": "mcap recover", ".db3": "ros2 bag reindex"}
 """Command that repairs a file, by its suffix."""
@@ -75,7 +73,7 @@ class BagSequence(ImageSequence):
             camera,
             path,
             lambda: _read_camera(path, topics),
-            depth_scale=_DEPTH_SCALE,
+            depth_scale=MILLIMETRES,
             image_size=lambda: _image_size(path, topics),
         )
         stamps, frame_ids, self._stamp_notes = _index_messages(path, topics, progress)
@@ -229,7 +227,7 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
     rows = (np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)).tolist()
     intrinsics = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
     distortion, model = ([], "") if topics.is_rectified else (np.asarray(D).tolist(), info.distortion_model)
-    size = {"width": info.width, "height": info.height, "depth_scale": _DEPTH_SCALE}
+    size = {"width": info.width, "height": info.height, "depth_scale": MILLIMETRES}
     lens = {"distortion": distortion, "distortion_model": model}
     return camera_from_fields(intrinsics | size | lens, f"{path}: {topics.info}")
 

@@ -21,7 +21,7 @@ def layout(world_title: str) -> rrb.Blueprint:
     curves = rrb.Tabs(
         rrb.TimeSeriesView(origin="seconds", name="Time per stage, s"),
         rrb.TimeSeriesView(origin="votes", name="Votes per object"),
-        rrb.TimeSeriesView(origin="chamfer", name="Chamfer distance per object, m"),
+        rrb.TimeSeriesView(origin="chamfer", name="Change of shape (Chamfer) per object, m"),
         rrb.TextLogView(origin="log", name="Log"),
     )
     return rrb.Blueprint(

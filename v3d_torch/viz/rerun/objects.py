@@ -53,7 +53,7 @@ def format_objects(frame_objects: FrameObjects) -> str:
     """Return a Markdown table of the objects of a frame, static objects last."""
     if not frame_objects.objects:
         return "no objects"
-    rows = ["| object | motion state | votes | Chamfer distance, m |", "|---|---|---:|---:|"]
+    rows = ["| object | motion state | votes | change of shape, m |", "|---|---|---:|---:|"]
     for obj in sorted(frame_objects.objects, key=lambda obj: (obj.motion_state is MotionState.STATIC, obj.id)):
         missed = ", missed" if obj.missed else ""
         chamfer = f"{obj.chamfer:.3f}" if math.isfinite(obj.chamfer) else ""

@@ -17,13 +17,14 @@ from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.evaluation import has_orientations
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import depth_to_units
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, transform_points
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
+from v3d_torch.viz.camera_path import FRUSTUM_DEPTH
 from v3d_torch.viz.rerun.layout import layout
 from v3d_torch.viz.rerun.objects import format_objects, log_objects, motion_state_classes, rgba
 from v3d_torch.viz.rerun.occupancy import log_floor, log_voxels
@@ -39,7 +40,6 @@ _MAP_GROWTH = 1.1
 _JPEG_QUALITY = 80
 _DEPTH_UNITS_PER_METRE = 1000
 _IMAGE_PLANE_DEPTH = 0.3  # metres from the current camera to its drawn image
-_FRUSTUM_DEPTH = 0.08  # metres from a keyframe to its drawn image plane
 
 
 class RerunViewer:
@@ -193,7 +193,7 @@ class RerunViewer:
         if not len(matches):
             return
         T_eg = T_ec @ invert(truth.T_wc[matches.groundtruth[0]])
-        positions = (truth.T_wc[:, :3, 3] @ T_eg[:3, :3].mT + T_eg[:3, 3]).numpy()
+        positions = transform_points(T_eg, truth.T_wc[:, :3, 3]).numpy()
         self._stream.log("world/groundtruth", _lines([positions], "goldenrod"))
         self._unaligned = None
 
@@ -223,7 +223,7 @@ def _frustums(camera: PinholeCamera, T_wc: Tensor) -> list[NDArray[np.float64]]:
     width, height = camera.width - 1.0, camera.height - 1.0
     corners = torch.tensor([[0, 0], [width, 0], [width, height], [0, height]], dtype=torch.float64)
     points = torch.zeros(5, 3, dtype=torch.float64)  # the last is the camera centre
-    points[:4, :2] = (corners - camera.K[:2, 2]) / camera.K.diagonal()[:2] * _FRUSTUM_DEPTH
-    points[:4, 2] = _FRUSTUM_DEPTH
+    points[:4, :2] = (corners - camera.K[:2, 2]) / camera.K.diagonal()[:2] * FRUSTUM_DEPTH
+    points[:4, 2] = FRUSTUM_DEPTH
     line = points[[0, 1, 2, 3, 0, 4, 1, 2, 4, 3]]
     return list((line @ T_wc[:, :3, :3].mT + T_wc[:, None, :3, 3]).numpy())
