@@ -82,6 +82,24 @@ def test_pair_is_found_by_name_among_several_videos(folder: Path) -> None:
         load_sequence(str(folder))
 
 
+def test_each_of_several_pairs_is_found_by_its_name(folder: Path) -> None:
+    """Names of which one begins with the other belong to different pairs; a lone video has no depth."""
+    for number, name in enumerate(("take", "take2")):
+        write_colour(folder / f"{name}.mkv", 15, 2)
+        write_video(folder / f"{name}_depth.mkv", 15, [depth_of(7 + number), depth_of(8 + number)])
+    for number, name in enumerate(("take", "take2")):
+        sequence = load_sequence(str(folder / f"{name}.mkv"))
+        assert isinstance(sequence, VideoSequence)
+        assert_frame(sequence, 1, 1, 8 + number)
+    with pytest.raises(InputError, match=r"rgb\.avi: expected one colour and one depth video, found rgb\.avi; name"):
+        load_sequence(str(folder / "rgb.avi"))
+
+
+def test_depth_video_alone_is_an_input_error(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"depth\.mkv: is a depth video by its name; give the colour video of "):
+        load_sequence(str(folder / "depth.mkv"))
+
+
 def test_progress_is_reported_for_every_colour_frame(folder: Path) -> None:
     reports: list[tuple[int, int | None]] = []
     load_sequence(str(folder), progress=lambda done, total: reports.append((done, total)))

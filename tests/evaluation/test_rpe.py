@@ -160,3 +160,11 @@ def test_time_between_poses_that_is_not_positive_is_an_error(delta: float) -> No
         rpe(truth.T_wc, truth.T_wc, truth.stamps, delta=delta)
     with pytest.raises(ConfigError, match=r"delta is .*; give a number above 0"):
         evaluate(truth, truth, rpe_delta=delta)
+
+
+def test_stamps_too_large_for_the_time_between_poses_give_no_pairs() -> None:
+    """Nanoseconds since 1970 as float64 do not change by a second that is added; no pose is paired with itself."""
+    truth, estimate = (random_walk(50, seed=seed).T_wc for seed in (42, 43))
+    stamps = 1.3e18 + 33_333_333 * torch.arange(50, dtype=torch.float64)
+    assert all(each.isnan() for each in rpe(truth, estimate, stamps))
+    assert evaluate(Trajectory(stamps, truth), Trajectory(stamps, estimate)).rpe is None

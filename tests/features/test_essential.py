@@ -10,6 +10,7 @@ from helpers.gradients import check_gradients
 from helpers.two_views import CAMERA, known_motion, two_views
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.features import sampson
 from v3d_torch.features.essential import essential_ransac
 from v3d_torch.geometry.se3 import hat
@@ -78,6 +79,29 @@ def test_padding_has_no_effect() -> None:
     padded = essential_ransac(uv_a, b.uv, CAMERA.K, valid=valid)
     assert torch.equal(padded.inliers[valid], alone.inliers) and not padded.inliers[~valid].any()
     assert difference(padded.E, alone.E) < 1e-6
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_pairs_with_a_pixel_that_is_not_finite_are_padding(value: float) -> None:
+    a, b, _ = two_views(outliers=60, noise=0.3)
+    uv_a, uv_b = a.uv.clone(), b.uv.clone()
+    uv_a[7, 0], uv_b[9] = value, -value
+    finite = uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
+    for with_gradient in (False, True):
+        K = CAMERA.K.clone().requires_grad_(with_gradient)
+        found, expected = essential_ransac(uv_a, uv_b, K), essential_ransac(a.uv, b.uv, K, valid=finite)
+        assert torch.equal(found.E, expected.E) and found.E.isfinite().all()
+        assert torch.equal(found.inliers, expected.inliers) and not found.inliers[~finite].any()
+        if with_gradient:
+            assert torch.autograd.grad(found.E.sum(), K)[0].isfinite().all()
+
+
+def test_negative_weight_is_an_error() -> None:
+    a, b, _ = two_views()
+    weights = torch.ones(400)
+    weights[3] = -1
+    with pytest.raises(InputError, match="weights has a value that is negative or NaN; give weights of at least 0"):
+        essential_ransac(a.uv, b.uv, CAMERA.K, weights)
 
 
 def test_gradients_equal_finite_differences(monkeypatch: pytest.MonkeyPatch) -> None:

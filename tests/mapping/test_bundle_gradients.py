@@ -8,8 +8,10 @@ from helpers import camera_inputs
 from helpers.gradients import check_gradients, count_graph_nodes
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.bundle_adjustment import bundle_adjust
 from v3d_torch.mapping.readout_calibration import estimate_readout
@@ -119,6 +121,20 @@ def test_observations_whose_pixel_is_not_finite_are_padding(value: float, with_g
             results[-1] += torch.autograd.grad(results[-1][-2].sum() + adjusted.points.sum(), weights)
     for one, other in zip(*results, strict=True):
         assert torch.equal(one, other) and not one.isnan().any()
+
+
+@pytest.mark.parametrize("value", [-1.0, torch.nan])
+def test_weight_that_is_negative_or_nan_is_an_error(value: float) -> None:
+    inputs = bundle() | {"valid": None}
+    inputs["weights"][..., 3] = value
+    with pytest.raises(InputError, match="weights has a value that is negative or NaN; give weights of at least 0"):
+        bundle_adjust(**inputs)
+
+
+@pytest.mark.parametrize("name", ["inverse_depth", "weights", "valid", "fixed"])
+def test_wrong_number_of_values_is_rejected(name: str) -> None:
+    with pytest.raises(ShapeError):
+        bundle_adjust(**bundle() | {name: torch.ones(7, dtype=torch.bool if name in ("valid", "fixed") else None)})
 
 
 def test_transforms_give_the_gradient() -> None:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
@@ -212,6 +213,17 @@ def test_wrong_number_of_values_is_rejected(name: str, size: int) -> None:
     wrong = torch.ones(size, dtype=torch.bool if name == "valid" else torch.float64)
     with pytest.raises(ShapeError):
         refine_pose(torch.eye(4), points, points[:, :2], CAMERA.K, **{name: wrong})
+
+
+@pytest.mark.parametrize("value", [-1.0, torch.nan])
+def test_weight_that_is_negative_or_nan_is_an_error(value: float) -> None:
+    _, points, measured, _ = measure_landmarks(8)
+    weights, valid = torch.ones(8), torch.ones(8, dtype=torch.bool)
+    weights[3] = value
+    with pytest.raises(InputError, match="weights has a value that is negative or NaN; give weights of at least 0"):
+        refine_pose(torch.eye(4), points, K=CAMERA.K, **vars(measured), weights=weights)
+    valid[3] = False
+    refine_pose(torch.eye(4), points, K=CAMERA.K, **vars(measured), weights=weights, valid=valid)  # padding
 
 
 def test_leading_dimensions_are_those_of_the_batch() -> None:

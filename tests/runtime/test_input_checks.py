@@ -125,6 +125,15 @@ def test_frame_that_is_not_later_is_rejected_without_effect(stamp: float) -> Non
         (replace(INSTANCES, labels=torch.tensor([-2, -1])), "labels for frame 7 contain -2, expected COCO classes"),
         (replace(INSTANCES, scores=INSTANCES.scores.double()), "scores for frame 7 are torch.float64"),
         (replace(INSTANCES, boxes=torch.zeros(2, 5)), r"boxes for frame 7 are torch.float32 of shape \(2, 5\)"),
+        (
+            replace(INSTANCES, scores=torch.tensor([0.5, torch.nan])),
+            "scores for frame 7 have values that are not from",
+        ),
+        (
+            replace(INSTANCES, scores=torch.tensor([0.5, 1.1])),
+            "frame 7 have values that are not from 0 to 1$",
+        ),
+        (replace(INSTANCES, boxes=torch.full((2, 4), torch.inf)), "boxes for frame 7 have values that are not finite$"),
     ],
 )
 def test_invalid_output_of_the_segmenter_is_rejected(returned: Any, message: str) -> None:

@@ -46,6 +46,8 @@ def change(**fields: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda result: replace(result, **{name: edit(getattr(result, name)) for name, edit in fields.items()})
 
 
+MIRROR = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))
+
 WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
     (
         "smooth_depth",
@@ -108,6 +110,28 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
         r"estimate_state\.covariance is .* \(3, 3\), .* \(6, 6\)$",
     ),
     ("track_camera", change(status=str), r"track_camera\.status is a str, expected a TrackingStatus"),
+    ("smooth_depth", lambda depth: depth * torch.nan, "^smooth_depth has values that are not finite and at least 0$"),
+    ("smooth_depth", torch.neg, "^smooth_depth has values that are not finite and at least 0$"),
+    ("detect_features", change(uv=lambda x: x * torch.nan), r"detect_features\.uv has values that are not finite$"),
+    ("detect_features", change(pixel=lambda x: x + 64), r"\.pixel has values that are not pixels of the image$"),
+    ("compensate", change(pixel=lambda x: x - 64), r"\.pixel has values that are not pixels of the image$"),
+    ("detect_features", change(depth=torch.neg), r"\.depth has values that are not finite and at least 0$"),
+    ("detect_features", change(octave=lambda x: x - 9), r"\.octave has values that are not finite and at least 0$"),
+    ("odometry", change(T_cp=lambda T: T * torch.nan), r"^odometry\.T_cp has values that are not those of a rigid tr"),
+    ("odometry", change(T_cp=lambda T: T * 2), r"^odometry\.T_cp has values that are not those of a rigid transform$"),
+    ("odometry", change(T_cp=lambda T: MIRROR @ T), r"\.T_cp has values that are not those of a rigid transform$"),
+    ("odometry", change(velocity=lambda x: x / 0), r"\.velocity has values that are not finite$"),
+    ("odometry", change(pairs=lambda _: torch.tensor([[0, 9999]])), r"\.pairs has values that are not indices of feat"),
+    ("odometry", change(pairs=lambda _: torch.tensor([[-1, 0]])), r"\.pairs has values that are not indices of featu"),
+    (
+        "describe_appearance",
+        lambda x: x * 2,
+        "^describe_appearance has values that are not at least 0 with sum 1, or N",
+    ),
+    ("describe_appearance", lambda x: x[:, :0], "^describe_appearance has values that are not at least 0 with sum 1, "),
+    ("track_camera", change(T_cw=lambda T: T / 2), r"\.T_cw has values that are not those of a rigid transform$"),
+    ("track_camera", change(landmarks=lambda x: x - 9), r"\.landmarks has values that are not ids or -1$"),
+    ("estimate_state", change(T_wc=lambda T: -T), r"\.T_wc has values that are not those of a rigid transform$"),
 ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -102,11 +103,11 @@ class VideoSequence(ImageSequence):
         return self._colour_path, self._depth_path
 
     def _read_colour(self, index: int) -> Tensor:
-        pixels = self._colour_frames[self._pairs[index][0]].retrieve()[1]
+        pixels = _retrieve(self._colour_frames[self._pairs[index][0]])
         return torch.from_numpy(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)).permute(2, 0, 1)
 
     def _read_depth(self, index: int) -> NDArray[np.generic]:
-        return self._depth_frames[self._pairs[index][1]].retrieve()[1].squeeze()
+        return _retrieve(self._depth_frames[self._pairs[index][1]]).squeeze()
 
 
 def is_video(path: Path) -> bool:
@@ -129,9 +130,12 @@ def _find_pair(path: Path) -> tuple[Path, Path]:
     """Find the colour video and the depth video for a folder or a colour video."""
     colour, depth = _list_videos(path if path.is_dir() else path.parent)
     if path.is_file():
-        colour = [path]
+        if path in depth:
+            raise InputError(f"{path}: is a depth video by its name; give the colour video of the pair")
         # With several pairs in one folder, take.mp4 belongs to take_depth.mkv.
-        depth = [other for other in depth if other.stem.startswith(path.stem)] or depth
+        named = [other for other in depth if _without_depth(other) == path.stem.lower()]
+        depth = named or (depth if len(colour) == 1 else [])
+        colour = [path]
     if len(colour) != 1 or len(depth) != 1:
         found = ", ".join(file.name for file in colour + depth)
         raise InputError(
@@ -141,12 +145,17 @@ def _find_pair(path: Path) -> tuple[Path, Path]:
     return colour[0], depth[0]
 
 
+def _without_depth(path: Path) -> str:
+    """Name of a depth video without the word "depth" and the separator before or after it, in lower case."""
+    return re.sub(r"[-_. ]depth|depth[-_. ]?", "", path.stem.lower(), count=1)
+
+
 def _frame_size(path: Path) -> tuple[int, int]:
     """Width and height of a depth video."""
     capture = next(_open_frames(path, is_depth=True), None)
     if capture is None:
         raise _undecodable_error(path)
-    height, width = capture.retrieve()[1].shape[:2]
+    height, width = _retrieve(capture).shape[:2]
     return width, height
 
 
@@ -182,7 +191,7 @@ def _read_stamps(
 
 
 def _check_depth_format(path: Path, capture: cv2.VideoCapture) -> None:
-    pixels = capture.retrieve()[1]
+    pixels = _retrieve(capture)
     if pixels.dtype != np.uint16 or pixels.squeeze().ndim != 2:
         raise InputError(
             f"{path}: depth is not one channel of 16 bits; export it again with ffmpeg -c:v ffv1 -pix_fmt gray16le"
@@ -201,9 +210,15 @@ def _open_frames(path: Path, *, is_depth: bool = False) -> Iterator[cv2.VideoCap
         yield capture
 
 
+def _retrieve(capture: cv2.VideoCapture) -> NDArray[np.uint8 | np.uint16]:
+    """Pixels of the frame at which a capture is."""
+    with _silence_opencv():
+        return np.asarray(capture.retrieve()[1])
+
+
 @contextmanager
 def _silence_opencv() -> Iterator[None]:
-    """Suppress OpenCV's warning on stderr that it does not convert to RGB, as requested."""
+    """Suppress OpenCV's warnings on stderr about formats that it does not convert to RGB, as requested."""
     level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     try:
         yield

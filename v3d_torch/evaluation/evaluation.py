@@ -24,6 +24,9 @@ MIN_PAIRS = 3
 _UNITS = {10**3: "milliseconds", 10**6: "microseconds", 10**9: "nanoseconds"}
 """Units of timestamps by their number in a second."""
 
+_MAX_PLAIN_STAMP = 1e20
+"""Timestamps beyond this are printed with an exponent, seconds: nanoseconds since 1970 have 19 digits."""
+
 _UNIT_TOLERANCE = 2.0
 """Maximum ratio of the durations of two trajectories of one sequence, of which one can be a part."""
 
@@ -226,4 +229,6 @@ def _is_same_time(a: Tensor, b: Tensor) -> bool:
 def _time_range(trajectory: Trajectory) -> str:
     if not len(trajectory):
         return "(empty)"
-    return f"({trajectory.stamps[0]:.2f} to {trajectory.stamps[-1]:.2f} s)"
+    first, last = trajectory.stamps[0], trajectory.stamps[-1]
+    digits = ".2f" if abs(last) < _MAX_PLAIN_STAMP else ".3g"
+    return f"({first:{digits}} to {last:{digits}} s)"

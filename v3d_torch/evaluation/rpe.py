@@ -175,8 +175,10 @@ def find_later(stamps: Tensor, count: Tensor, delta: float) -> tuple[Tensor, Ten
     before = (after - 1).clamp(min=0)
     at_before, at_after = stamps.gather(-1, before), stamps.gather(-1, after)
     second = torch.where(later - at_before <= at_after - later, before, after)
-    exists = torch.arange(stamps.shape[-1], device=stamps.device) < count[..., None]
-    return second, exists & (second != last) & ((stamps.gather(-1, second) - later).abs() <= delta / 2)
+    index = torch.arange(stamps.shape[-1], device=stamps.device)
+    is_later = second > index  # false if the stamps are so large that adding delta does not change them
+    is_near = (stamps.gather(-1, second) - later).abs() <= delta / 2
+    return second, (index < count[..., None]) & is_later & (second != last) & is_near
 
 
 def _take_poses(T: Tensor, index: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
 from v3d_torch.optim.implicit import needs_gradient
-from v3d_torch.runtime.batches import common_batch, fill_padding, mask_or_all
+from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, mask_or_all
 
 _MIN_PAIRS = 6
 """Minimum number of pairs: a sample of 5, and one more pair that can confirm its matrix."""
@@ -69,7 +69,8 @@ def essential_ransac(
         uv_b: Undistorted pixels of the same points in image b, shape :math:`(*, N, 2)`.
         K: Camera matrix of both images, shape :math:`(*, 3, 3)`.
         weights: Weight of each pair in the refinement, not negative, shape :math:`(*, N)`; None for 1.
-        valid: Mask of the pairs that are not padding, bool, shape :math:`(*, N)`; None for all.
+        valid: Mask of the pairs that are not padding, bool, shape :math:`(*, N)`; None for all. A pair with a pixel
+            that is not finite counts as padding.
         threshold: Maximum Sampson distance of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
@@ -79,7 +80,7 @@ def essential_ransac(
         fewer than 6 pairs.
 
     Raises:
-        InputError: If ``valid`` is not bool.
+        InputError: If ``valid`` is not bool, or a weight is negative or NaN.
         ConfigError: If ``threshold`` or ``iterations`` is not positive.
     """
     check_masks(valid=valid)
@@ -88,11 +89,10 @@ def essential_ransac(
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     weights = torch.ones_like(uv_a[..., 0]) if weights is None else weights
-    present = mask_or_all(valid, uv_a[..., 0])
-    pairs = weights.shape[:-1], present.shape[:-1]
-    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], *pairs)
-    mask = present.expand(*batch, -1)
-    row = None if valid is None else valid[..., None]
+    valid = mask_or_all(valid, uv_a[..., 0]) & uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
+    check_weights(weights, valid)
+    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], weights.shape[:-1], valid.shape[:-1])
+    mask, row = valid.expand(*batch, -1), valid[..., None]
     problem = EpipolarProblem(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),
         b=_homogeneous(fill_padding(uv_b, row, 0.0).expand(*batch, -1, 2)),

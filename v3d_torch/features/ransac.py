@@ -93,7 +93,7 @@ def pnp_ransac(
     Args:
         points: Points in a frame "w", metres, floating point, shape :math:`(*, N, 3)`.
         uv: Undistorted pixels of the points, shape :math:`(*, N, 2)`.
-        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
         initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`; None, or NaN in a batch, if there is no prediction.
             If the refined prediction explains more than half of the points, RANSAC is skipped.
         valid: Mask of the points that are not padding, bool, shape :math:`(*, N)`; None for all.

@@ -99,7 +99,7 @@ def bundle_adjust(
         pose: Index of the pose from which each observation was made, from 0 to P - 1, int64, shape :math:`(*, M)`;
             any index for padding.
         point: Index of the observed landmark, from 0 to L - 1, int64, shape :math:`(*, M)`; any index for padding.
-        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0, NaN or infinite = not measured.
             None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
@@ -117,8 +117,8 @@ def bundle_adjust(
         for integers; chi2 and costs at least in float32.
 
     Raises:
-        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, or if a
-            pose or landmark is not finite.
+        InputError: If ``pose`` or ``point`` is not int64 or has an index out of range, if a mask is not bool, if a pose
+            or landmark is not finite, or if a weight is negative or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     problem, initial, valid = prepare_bundle(

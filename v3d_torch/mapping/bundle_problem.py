@@ -26,7 +26,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import check_finite_arguments, common_batch, fill_indices, fill_padding
+from v3d_torch.runtime.batches import check_finite_arguments, check_weights, common_batch, fill_indices, fill_padding
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -215,7 +215,8 @@ def prepare_bundle(
         shape :math:`(..., M)`.
 
     Raises:
-        InputError: If a mask is not bool, an index is not int64 or out of range, or a pose or point is not finite.
+        InputError: If a mask is not bool, an index is not int64 or out of range, a pose or point is not finite, or a
+            weight is negative or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     check_masks(fixed=fixed, valid=valid)
@@ -224,6 +225,11 @@ def prepare_bundle(
     KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])
     KORNIA_CHECK_SHAPE(point, ["*", str(pose.shape[-1])])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    for column in (inverse_depth, weights, valid):
+        if column is not None:
+            KORNIA_CHECK_SHAPE(column, ["*", str(pose.shape[-1])])
+    if fixed is not None:
+        KORNIA_CHECK_SHAPE(fixed, ["*", str(T_cw.shape[-3])])
     check_finite_arguments(T_cw=T_cw, points=points)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
@@ -235,6 +241,8 @@ def prepare_bundle(
     point = fill_indices("point", point, points.shape[-2], valid)
     if weights is None:
         weights = torch.ones(pose.shape, dtype=torch.float64, device=uv.device)
+    else:
+        check_weights(weights, valid)
     batch = common_batch(
         T_cw.shape[:-3],
         points.shape[:-2],

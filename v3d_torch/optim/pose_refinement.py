@@ -39,7 +39,7 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
-from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
+from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, to_rows
 
 
 class PoseRefinement(NamedTuple):
@@ -168,7 +168,7 @@ def refine_pose(
             float64.
         points: Landmark of each measurement, world frame, metres, shape :math:`(*, N, 3)`.
         uv: Measured pixels, undistorted, shape :math:`(*, N, 2)`.
-        K: Camera matrix, shape :math:`(*, 3, 3)`.
+        K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0, NaN or infinite = not measured.
             None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, N)`.
@@ -185,7 +185,7 @@ def refine_pose(
         least in float32. A pose without measurements is the prediction.
 
     Raises:
-        InputError: If ``valid`` is not bool.
+        InputError: If ``valid`` is not bool, or a weight is negative or NaN.
         ConfigError: If ``rounds``, or a standard deviation that is a number, is not positive.
 
     Example:
@@ -217,6 +217,8 @@ def refine_pose(
             KORNIA_CHECK_SHAPE(each, ["*", str(points.shape[-2])])
     finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
+    if weights is not None:
+        check_weights(weights, valid)
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     scale, offset = whiten(measured, K.to(torch.float64))
     thresholds = measured.chi2_threshold

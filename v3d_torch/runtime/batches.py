@@ -71,6 +71,20 @@ def check_finite_arguments(**values: Tensor) -> None:
             raise InputError(f"{name} has a value that is not finite; give finite numbers")
 
 
+def check_weights(weights: Tensor, valid: Tensor) -> None:
+    """Check that weights are not negative, if they can be read at once: with others, a cost has no minimum.
+
+    Args:
+        weights: Weights of the measurements.
+        valid: Mask of the measurements that are not padding, bool, a shape that broadcasts.
+
+    Raises:
+        InputError: If the weight of a measurement is negative or NaN.
+    """
+    if can_read(weights) and can_read(valid) and bool((~(weights >= 0) & valid).any()):
+        raise InputError("weights has a value that is negative or NaN; give weights of at least 0")
+
+
 def common_batch(*batches: torch.Size) -> torch.Size:
     """Return the broadcast shape of several batch shapes; faster than torch if those with dimensions are equal."""
     first, *others = {batch for batch in batches if batch} or {torch.Size()}

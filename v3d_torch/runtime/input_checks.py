@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,19 +13,32 @@ from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import implausible_median
+from v3d_torch.runtime.value_rules import FINITE, FRACTIONS, Rule
 from v3d_torch.types import Instances, RGBDFrame
 
 _MAX_NORM_ERROR = 1e-3
 """Maximum difference between the length of a unit vector and 1."""
 
-TensorSpec = tuple[torch.dtype, tuple[int | str, ...]]
-"""Dtype and shape of a tensor; dimensions with the same name have the same size."""
+
+class TensorSpec(NamedTuple):
+    """Expected dtype, shape and values of a tensor.
+
+    Attributes:
+        dtype: Dtype.
+        dimensions: Sizes; dimensions with the same name have the same size.
+        rule: Rule for the values; None for any values.
+    """
+
+    dtype: torch.dtype
+    dimensions: tuple[int | str, ...]
+    rule: Rule | None = None
+
 
 INSTANCES: Mapping[str, TensorSpec] = {
-    "masks": (torch.bool, ("N", "H", "W")),
-    "labels": (torch.int64, ("N",)),
-    "scores": (torch.float32, ("N",)),
-    "boxes": (torch.float32, ("N", 4)),
+    "masks": TensorSpec(torch.bool, ("N", "H", "W")),
+    "labels": TensorSpec(torch.int64, ("N",)),
+    "scores": TensorSpec(torch.float32, ("N",), FRACTIONS),
+    "boxes": TensorSpec(torch.float32, ("N", 4), FINITE),
 }
 """Fields of `Instances`."""
 
@@ -118,10 +132,12 @@ def check_instances(instances: Instances, frame: RGBDFrame, labels: range) -> No
             f"the segmenter returned {describe_type(instances)} for frame {frame.index}; it must return Instances"
         )
     sizes = {"N": len(instances.masks), "H": frame.image.shape[-2], "W": frame.image.shape[-1]}
-    for name, (dtype, dimensions) in INSTANCES.items():
-        shape = fill_in(dimensions, sizes)
-        if (wrong := describe_wrong_tensor(getattr(instances, name), shape, dtype)) is not None:
+    for name, (dtype, dimensions, rule) in INSTANCES.items():
+        value, shape = getattr(instances, name), fill_in(dimensions, sizes)
+        if (wrong := describe_wrong_tensor(value, shape, dtype)) is not None:
             raise ConfigError(f"the segmenter's {name} for frame {frame.index} are {wrong}")
+        if rule is not None and not rule.holds(value, sizes):
+            raise ConfigError(f"the segmenter's {name} for frame {frame.index} have values that are not {rule.text}")
     if instances.track_ids is not None:
         raise ConfigError(
             f"the segmenter's track_ids for frame {frame.index} are set; leave them None, because the tracker of the"

@@ -17,75 +17,83 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
 from v3d_torch.runtime.stage_hooks import HookedStage, StageHook
 from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
 from v3d_torch.runtime.stateful import Stateful, is_stateful
+from v3d_torch.runtime.value_rules import FINITE, HISTOGRAMS, IDS, NOT_NEGATIVE, PAIRS, PIXELS, POSITIVE, RIGID
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
 
 _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
     Features: {
-        "uv": (torch.float64, ("N", 2)),
-        "pixel": (torch.int64, ("N", 2)),
-        "depth": (torch.float64, ("N",)),
-        "octave": (torch.int64, ("N",)),
-        "descriptors": (torch.uint8, ("N", 32)),
-        "readout_jacobian": (torch.float64, ("N", 2)),
-        "sigma_ratio": (torch.float64, ("N", 2)),
+        "uv": TensorSpec(torch.float64, ("N", 2), FINITE),
+        "pixel": TensorSpec(torch.int64, ("N", 2), PIXELS),
+        "depth": TensorSpec(torch.float64, ("N",), NOT_NEGATIVE),
+        "octave": TensorSpec(torch.int64, ("N",), NOT_NEGATIVE),
+        "descriptors": TensorSpec(torch.uint8, ("N", 32)),
+        "readout_jacobian": TensorSpec(torch.float64, ("N", 2), FINITE),
+        "sigma_ratio": TensorSpec(torch.float64, ("N", 2), POSITIVE),
     },
     CameraMotion: {
-        "T_cp": (torch.float64, (4, 4)),
-        "velocity": (torch.float64, (6,)),
-        "pairs": (torch.int64, ("K", 2)),
+        "T_cp": TensorSpec(torch.float64, (4, 4), RIGID),
+        "velocity": TensorSpec(torch.float64, (6,), FINITE),
+        "pairs": TensorSpec(torch.int64, ("K", 2), PAIRS),
         "is_measured": bool,
     },
-    NewlyOccupied: {"appeared": (torch.float64, ("B", "h", "w")), "stride": int},
+    NewlyOccupied: {"appeared": TensorSpec(torch.float64, ("B", "h", "w")), "stride": int},
     Instances: INSTANCES,
     InstanceClouds: {
-        "points": (torch.float32, ("N", "P", 3)),
-        "valid": (torch.bool, ("N", "P")),
-        "centroid": (torch.float32, ("N", 3)),
-        "cloud_pixels": (torch.bool, ("N", "H", "W")),
+        "points": TensorSpec(torch.float32, ("N", "P", 3)),
+        "valid": TensorSpec(torch.bool, ("N", "P")),
+        "centroid": TensorSpec(torch.float32, ("N", 3)),
+        "cloud_pixels": TensorSpec(torch.bool, ("N", "H", "W")),
     },
     FrameObjects: {
         "objects": list,
-        "static_mask": (torch.bool, ("H", "W")),
-        "static_without_people": (torch.bool, ("H", "W")),
+        "static_mask": TensorSpec(torch.bool, ("H", "W")),
+        "static_without_people": TensorSpec(torch.bool, ("H", "W")),
         "vote_pairs": list,
     },
     CameraState: {
         "stamp": float,
-        "T_wc": (torch.float64, (4, 4)),
+        "T_wc": TensorSpec(torch.float64, (4, 4), RIGID),
         "status": TrackingStatus,
-        **dict.fromkeys(("covariance", "twist_covariance", "cross_covariance"), (torch.float64, (6, 6))),
-        "twist": (torch.float64, (6,)),
+        **dict.fromkeys(("covariance", "twist_covariance", "cross_covariance"), TensorSpec(torch.float64, (6, 6))),
+        "twist": TensorSpec(torch.float64, (6,), FINITE),
     },
     FramePose: {
         "status": TrackingStatus,
-        "T_cw": (torch.float64, (4, 4)),
-        "landmarks": (torch.int64, ("N",)),
+        "T_cw": TensorSpec(torch.float64, (4, 4), RIGID),
+        "landmarks": TensorSpec(torch.int64, ("N",), IDS),
         "is_relocalised": bool,
     },
 }
-"""Fields of each class that a stage returns: dtype and shape of tensors, else the type."""
+"""Fields of each class that a stage returns: dtype, shape and values of tensors, else the type."""
 
 
 def _image_size(image: Tensor) -> dict[str, int]:
     return dict(zip("HW", image.shape[-2:], strict=True))
 
 
+def _feature_counts(previous: TrackedFrame | None, current: TrackedFrame) -> dict[str, int]:
+    return {"previous": 0 if previous is None else len(previous.features), "current": len(current.features)}
+
+
 _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] | None] = {
-    "smooth_depth": ((torch.float32, ("B", 1, "H", "W")), lambda depth: {"B": len(depth), **_image_size(depth)}),
-    "detect_features": (Features, lambda *_: {}),
-    "compensate": (Features, lambda features, *_: {"N": len(features)}),
-    "odometry": (CameraMotion, lambda *_: {}),
+    "smooth_depth": (
+        TensorSpec(torch.float32, ("B", 1, "H", "W"), NOT_NEGATIVE),
+        lambda depth: {"B": len(depth), **_image_size(depth)},
+    ),
+    "detect_features": (Features, lambda image, depth: _image_size(image)),
+    "compensate": (Features, lambda features, depth, *_: {"N": len(features), **_image_size(depth)}),
+    "odometry": (CameraMotion, lambda previous, current, *_: _feature_counts(previous, current)),
     "free_space_check": (NewlyOccupied, lambda *_: {}),
     "propose_unlabelled": (Instances, lambda occupied, instances, depth: _image_size(depth)),
     "back_project_instances": (InstanceClouds, lambda depth, instances: {"N": len(instances), **_image_size(depth)}),
-    "describe_appearance": ((torch.float32, ("N", "D")), lambda image, masks: {"N": len(masks)}),
+    "describe_appearance": (TensorSpec(torch.float32, ("N", "D"), HISTOGRAMS), lambda image, masks: {"N": len(masks)}),
     "classify_motion": (FrameObjects, lambda instances, clouds, view, *_: _image_size(view.depth)),
     "track_camera": (FramePose, lambda features, *_: {"N": len(features)}),
     "estimate_state": (CameraState, lambda *_: {}),
@@ -175,7 +183,7 @@ class ReplaceableStages:
 
 
 class ReplacedStage(CheckingProxy):
-    """Proxy of a user-defined stage that checks types, shapes, dtypes and devices of its results.
+    """Proxy of a user-defined stage that checks types, shapes, dtypes, devices and values of its results.
 
     Args:
         stage: User-defined stage.
@@ -212,8 +220,6 @@ class ReplacedStage(CheckingProxy):
         if isinstance(expected, type) and not isinstance(result, expected):
             raise ConfigError(f"{self._name} returned {describe_type(result)}; it must return {expected.__name__}")
         _check_value(self._name, result, expected, sizes(*args))
-        if isinstance(result, Features) and not ((result.sigma_ratio > 0) & result.sigma_ratio.isfinite()).all():
-            raise ConfigError(f"{self._name}.sigma_ratio has values that are not positive and finite")
 
 
 def require_state(name: str, component: object) -> Stateful:
@@ -237,7 +243,7 @@ def _check_value(name: str, value: object, expected: type | TensorSpec, sizes: d
     Args:
         name: Name of the value in messages.
         value: Value.
-        expected: Its class, or dtype and shape of a tensor.
+        expected: Its class, or what a tensor must be.
         sizes: Known sizes by the name of the dimension; sizes that are first seen in the value are added.
 
     Raises:
@@ -249,9 +255,11 @@ def _check_value(name: str, value: object, expected: type | TensorSpec, sizes: d
         for field, kind in _FIELDS.get(expected, {}).items():
             _check_value(f"{name}.{field}", getattr(value, field), kind, sizes)
         return
-    dtype, dimensions = expected
+    dtype, dimensions, rule = expected
     shape = fill_in(dimensions, sizes)
     if (wrong := describe_wrong_tensor(value, shape, dtype)) is not None:
         raise ConfigError(f"{name} is {wrong}")
-    found = cast("Tensor", value).shape
-    sizes |= {name: size for name, size in zip(shape, found, strict=True) if isinstance(name, str)}
+    tensor = cast("Tensor", value)
+    sizes |= {name: size for name, size in zip(shape, tensor.shape, strict=True) if isinstance(name, str)}
+    if rule is not None and not rule.holds(tensor, sizes):
+        raise ConfigError(f"{name} has values that are not {rule.text}")
