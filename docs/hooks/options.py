@@ -9,7 +9,7 @@ from typing import Any
 
 from typer.main import get_command
 
-_PLACEHOLDER = re.compile(r"^\{\{ options of (\w+) \}\}$", re.MULTILINE)
+_PLACEHOLDER = re.compile(r"^<!-- options of (\w+) -->$", re.MULTILINE)
 
 _SPECIAL = re.compile(r"[\[\]|*_]")
 """Characters that are markup in a table cell."""
