@@ -243,7 +243,8 @@ def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(
     """The delay of the depth image is that of its timestamp and that of the camera together."""
     delay = 0.012
     camera = replace(demo.camera, depth_delay=delay - by_stamps)
-    slam = V3DSLAM(camera, NoSegmentation())
+    overrides = ["occupancy.enabled=true", "occupancy.interval=1"]
+    slam = V3DSLAM(camera, NoSegmentation(), load_config(overrides=overrides))
     motions: list[CameraMotion] = []
     views: list[DepthView] = []
     slam.register_stage_hook("odometry", lambda name, args, motion: motions.append(motion))
@@ -256,6 +257,8 @@ def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(
     torch.testing.assert_close(views[-1].T_cw, T_dc @ motions[-1].T_cp @ before)
     stored = slam.free_space_check.state_dict()["views"][-1]
     torch.testing.assert_close(stored.T_cw, T_dc @ slam.poses.T_cw)
+    assert slam.occupancy is not None
+    torch.testing.assert_close(slam.occupancy.state_dict()["store"]["T_dw"][-1], T_dc @ slam.poses.T_cw)
 
 
 def test_views_before_a_loss_are_compared_only_when_the_camera_is_found(demo: RGBDSequence) -> None:

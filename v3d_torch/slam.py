@@ -264,7 +264,7 @@ class V3DSLAM(FramePreprocessor):
             self.states.append(state)
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
-                self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate())
+                self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate(), T_dc)
         objects = self.classify_motion.apply_corrections(
             objects
         )  # corrections of the world since the objects were tracked

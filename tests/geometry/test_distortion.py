@@ -102,7 +102,10 @@ def test_undistorted_bounds_contain_all_undistorted_pixels() -> None:
     u_min, v_min, u_max, v_max = FISHEYE.undistorted_bounds
     u, v = FISHEYE.undistort(corners).unbind(dim=1)
     assert u_min < u.min() < -500 and v_min < v.min() and u.max() < u_max and v.max() < v_max
-    assert BROWN.undistorted_bounds == (0, 0, 640, 480)
+    u_min, v_min, u_max, v_max = BROWN.undistorted_bounds
+    u, v = BROWN.undistort(corners).unbind(dim=1)
+    assert u_min < u.min() and v_min < v.min() and u.max() < u_max and v.max() < v_max
+    assert PinholeCamera(300.0, 300.0, 319.5, 239.5, 640, 480).undistorted_bounds == (0, 0, 640, 480)
 
 
 @pytest.mark.parametrize(

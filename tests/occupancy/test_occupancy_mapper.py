@@ -47,13 +47,14 @@ class Drive:
         last: int,
         status: TrackingStatus = TrackingStatus.TRACKED,
         up: UpDirection | None = None,
+        T_dc: Tensor | None = None,
     ) -> None:
         """Add frames; what the camera sees does not depend on the corrections of the keyframes."""
         for index in range(first, last):
             own = self.keyframes[index // 18 % 2]
             T_cw = invert(POSES[index % 36]) @ POSES[18 * (index // 18 % 2)] @ own.T_cw
             self.poses.append(index / 30, FramePose(status, T_cw, torch.zeros(0).long()), MOTION, own, None)
-            self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses, up)
+            self.mapper(render(POSES[index % 36], CRATE), ALL, self.poses, up, T_dc)
 
     def correct(self, row: int = 0, shift: Tensor = SHIFT) -> None:
         """Move a keyframe, as bundle adjustment and loop closing do."""
@@ -94,6 +95,20 @@ def test_map_without_corrections_is_not_rebuilt() -> None:
     drive.correct(shift=se3_exp(torch.tensor([0.01, 0, 0, 0, 0, 0], dtype=torch.float64)))  # less than half a voxel
     drive.mapper.correct(drive.poses)
     assert not is_rebuilding(drive.mapper) and torch.equal(drive.mapper.map.blocks.log_odds, before["log_odds"])
+
+
+def test_depth_belongs_to_the_pose_at_its_time() -> None:
+    """A camera that has moved by ``T_dc`` when the depth image is taken, also after a correction of the poses."""
+    delayed, moved = Drive(OccupancyMapper(CONFIG, CAMERA)), Drive(OccupancyMapper(CONFIG, CAMERA))
+    T_dc = se3_exp(torch.tensor([0.02, 0.0, 0.03, 0.0, 0.05, 0.0], dtype=torch.float64))
+    delayed.add(0, 1, T_dc=T_dc)
+    moved.keyframes[0].T_cw = T_dc @ moved.keyframes[0].T_cw
+    moved.add(0, 1)
+    assert same_map(delayed.mapper.map, moved.mapper.map)
+    for drive in (delayed, moved):
+        drive.correct()
+        drive.mapper.correct(drive.poses)
+    assert same_map(delayed.mapper.map, moved.mapper.map)
 
 
 def test_corrected_map_equals_the_map_of_the_corrected_poses() -> None:

@@ -14,6 +14,7 @@ from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.view_store import LEVER, ViewStore, displacement
 
+EYE = torch.eye(4, dtype=torch.float64)
 ALL = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
 
 
@@ -26,7 +27,7 @@ def store_of(capacity: int, *x: float) -> ViewStore:
     """Store to which views at these places were added."""
     store, view = ViewStore(capacity), RangeView.sample(0, torch.ones(240, 320), ALL, 8)
     for frame, T_cw in enumerate(poses_of(*x)):
-        store.append(view, frame, T_cw)
+        store.append(view, frame, T_cw, EYE)
         store.reduce()
     return store
 
@@ -100,7 +101,7 @@ def test_turned_cameras_at_one_place_are_kept() -> None:
     for frame in range(60):
         twist = torch.zeros(6, dtype=torch.float64)
         twist[4] = 2 * torch.pi * (frame % 6) / 6
-        store.append(view, frame, se3_exp(twist))
+        store.append(view, frame, se3_exp(twist), EYE)
         store.reduce()
     assert {frame % 6 for frame in store.frames} == set(range(6)) and min(store.frames[:6]) > 40
 
@@ -122,10 +123,10 @@ def test_farthest_views_are_removed_on_a_long_path(caplog: pytest.LogCaptureFixt
 def test_newest_view_is_kept_and_the_order_does_not_change(x: list[float]) -> None:
     store, view = ViewStore(6), RangeView.sample(0, torch.ones(240, 320), ALL, 8)
     for frame, T_cw in enumerate(poses_of(*x)):
-        store.append(view, frame, T_cw)
+        store.append(view, frame, T_cw, EYE)
         before = list(store.frames)
         kept = store.reduce()
         assert len(store) <= 6 and store.frames[-1] == frame and store.frames == sorted(store.frames)
         assert (kept is None) == (len(before) <= 6)
         assert kept is None or [each for each, keep in zip(before, kept.tolist(), strict=True) if keep] == store.frames
-        assert torch.equal(store.T_cw, torch.stack([poses_of(x[each])[0] for each in store.frames]))
+        assert torch.equal(store.T_dw, torch.stack([poses_of(x[each])[0] for each in store.frames]))

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from v3d_torch.optim.schur import REGULARISATION, NormalEquations, solve_normal_equations, sum_columns
+from v3d_torch.optim.schur import SCHUR_REGULARISATION, NormalEquations, solve_normal_equations, sum_columns
 
 
 def equations(batch: tuple[int, ...], poses: int, points: int, observations: int) -> NormalEquations:
@@ -36,7 +36,7 @@ def solve_densely(system: NormalEquations, damping: float) -> Tensor:
             rows, columns = slice(6 * F + 3 * p, 6 * F + 3 * p + 3), slice(6 * f, 6 * f + 6)
             H[rows, columns] += system.W[..., m]
             H[columns, rows] += system.W[..., m].T
-    H.diagonal().mul_(1 + damping).add_(REGULARISATION)
+    H.diagonal().mul_(1 + damping).add_(SCHUR_REGULARISATION)
     gradient = torch.cat([system.pose_gradient.T.flatten(), system.point_gradient.T.flatten()])
     return torch.linalg.solve(H, -gradient)
 

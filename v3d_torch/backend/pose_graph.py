@@ -15,7 +15,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
@@ -25,10 +25,12 @@ from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradien
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
+    check_weights,
     common_batch,
     fill_indices,
     fill_padding,
     from_rows,
+    mask_or_all,
     to_rows,
 )
 
@@ -103,10 +105,13 @@ def optimise_pose_graph(
         Poses without a path of edges to a fixed pose are determined only relative to each other.
 
     Raises:
-        InputError: If ``edges`` is not int64, or has an index out of range, if a mask is not bool, or if a pose is not
-            finite.
+        InputError: If ``edges`` is not int64, or has an index out of range, if a mask is not bool, if a pose or an
+            information matrix is not finite, or if a weight is negative or NaN.
+        ConfigError: If ``robust`` is not positive.
     """
     check_masks(fixed=fixed, valid=valid)
+    if robust is not None:
+        check_positive(robust=robust)
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
@@ -244,8 +249,9 @@ def _prepare(
     if valid is not None:
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
-    check_finite_arguments(T_wc=T_wc, T_ij=T_ij)
+    check_finite_arguments(T_wc=T_wc, T_ij=T_ij, information=information)
     weights = fill_padding(weights, valid, 0.0)
+    check_weights(weights, mask_or_all(None, weights))
     batch = common_batch(
         T_wc.shape[:-3],
         edges.shape[:-2],

@@ -131,7 +131,7 @@ def _check_constant_depth(views: StaticViews) -> list[str]:
     constant = [view for view, (low, high) in zip(examined, ranges, strict=True) if low == high]
     if 2 * len(constant) <= len(examined):
         return []
-    axes = torch.stack([view.T_cw[2, :3] for view in constant])  # optical axes in the world frame
+    axes = torch.stack([view.T_dw[2, :3] for view in constant])  # optical axes in the world frame
     if float((axes @ axes.T).min()) > math.cos(_MIN_TURN):
         return []
     return [

@@ -114,6 +114,7 @@ class SelfCalibration:
         self._given_readout = self._readout if self.given.readout is None else self.given.readout
         self._fixed = torch.arange(len(keyframes)) == 0  # fixes the gauge
         self._pixel = camera.distort(self.observations.measured.uv)  # in the recorded image
+        _, self._scale = _undistort_with_scale(camera, self._pixel)
         self._readout_jacobian = tables.observations["readout_jacobian"].index_select(0, self.observations.rows)
         self.T_cw, self.points = tables.T_cw[keyframes], tables.landmarks["point"][landmarks]
         for _ in range(2):
@@ -222,7 +223,7 @@ class SelfCalibration:
             measured,
             uv=uv + (readout - self._readout) * self._readout_jacobian,
             inverse_depth=torch.where(measured.inverse_depth > 0, measured.inverse_depth + change, 0.0),
-            pixel_sigma=scale * measured.pixel_sigma,
+            pixel_sigma=scale / self._scale * measured.pixel_sigma,  # the noise was estimated with the first camera
         )
         return replace(self.observations, measured=changed), camera
 

@@ -80,7 +80,8 @@ def decide(name: str, given: float, value: float, sigma: float, tolerance: float
     """
     if not sigma <= tolerance:
         return Estimate(name, given, value, sigma, accepted=False, reason=NOT_DETERMINED)
-    difference, variance = torch.tensor([value - given]).double(), torch.tensor([[sigma**2]]).double()
+    difference = torch.tensor([value - given], dtype=torch.float64)
+    variance = torch.tensor([[sigma**2]], dtype=torch.float64)
     if p_value(difference, variance, torch.zeros_like(variance)) > MAX_P_VALUE:
         return Estimate(name, given, value, sigma, accepted=False, reason=AGREES)
     return Estimate(name, given, value, sigma, accepted=True, reason="")
@@ -203,7 +204,8 @@ class ParameterSelection:
     def _p_value(self, group: ParameterGroup) -> float:
         """Probability that a difference from the given values as large as this one occurs by chance."""
         names = list(group.parameters)
-        difference = torch.tensor([self.fit.values[name] for name in names]) - self._problem.given_values(names)
+        found = torch.tensor([self.fit.values[name] for name in names], dtype=torch.float64)
+        difference = found - self._problem.given_values(names)
         model_error = torch.tensor([self.fit.model_error(name) for name in names], dtype=torch.float64)
         return p_value(difference, self.fit.covariance_of(group), model_error.square().diag())
 

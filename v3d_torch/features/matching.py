@@ -99,7 +99,7 @@ def match_descriptors(
         a_valid: Mask of the descriptors of ``a`` that are not padding, bool, shape :math:`(*, N)`; None for all.
         b_valid: Mask of the descriptors of ``b`` that are not padding, bool, shape :math:`(*, M)`; None for all.
         max_hamming: Maximum Hamming distance, bits.
-        max_ratio: Maximum ratio of the best to the second-best distance.
+        max_ratio: The best distance is less than this fraction of the second-best.
 
     Returns:
         Row of ``b`` that each row of ``a`` matches, -1 for none, int64, shape :math:`(*, N)`. There are no matches if
@@ -144,7 +144,7 @@ class DescriptorMatcher(torch.nn.Module):
 
     Args:
         max_hamming: Maximum Hamming distance, bits.
-        max_ratio: Maximum ratio of the best to the second-best distance.
+        max_ratio: The best distance is less than this fraction of the second-best.
     """
 
     def __init__(self, max_hamming: int = MAX_HAMMING, max_ratio: float = MAX_RATIO) -> None:

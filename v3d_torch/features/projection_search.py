@@ -139,7 +139,7 @@ def _pairs_within(
 
 def _cells(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
     """Grid cells (column, row) of pixels relative to the grid's origin, both (2, N)."""
-    with np.errstate(invalid="ignore"):  # nothing is near a pixel that is NaN, whatever its cell
+    with np.errstate(invalid="ignore"):  # nothing is near a projection that is NaN, whatever its cell
         return np.floor(pixels / _CELL).astype(np.int64)
 
 

@@ -96,7 +96,8 @@ def pnp_ransac(
         K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
         initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`; None, or NaN in a batch, if there is no prediction.
             If the refined prediction explains more than half of the points, RANSAC is skipped.
-        valid: Mask of the points that are not padding, bool, shape :math:`(*, N)`; None for all.
+        valid: Mask of the points that are not padding, bool, shape :math:`(*, N)`; None for all. A point that is not
+            finite, or whose pixel is not, counts as padding.
         threshold: Maximum reprojection error of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
@@ -113,7 +114,7 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    present = mask_or_all(valid, uv[..., 0])
+    present = mask_or_all(valid, uv[..., 0]) & points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)
     guess = torch.Size() if initial_guess is None else initial_guess.shape[:-2]
     batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2], present.shape[:-1], guess)
     mask = present.expand(*batch, -1)

@@ -173,7 +173,7 @@ class PinholeCamera:
         Returns:
             Pixels of an ideal pinhole camera with the same ``K``, float64, shape :math:`(N, 2)`, without gradients.
         """
-        uv = uv.to(torch.float64)
+        uv = uv.detach().to(torch.float64)
         if not self.is_distorted or uv.shape[0] == 0:
             return uv
         return undistort_pixels(uv, self.K, self.distortion_model, self.distortion)
@@ -186,15 +186,15 @@ class PinholeCamera:
         square of depth (Khoshelham and Elberink, Accuracy and Resolution of Kinect Depth Data, Sensors 2012).
 
         Args:
-            depth: Measured depth, metres, any shape; 0 = no measurement.
+            depth: Measured depth, metres, any shape; 0 or not finite = no measurement.
 
         Returns:
-            Corrected depth, 0 where it would be infinite; the same tensor if the camera has no offset.
+            Corrected depth, 0 without a measurement and where it would be infinite; the same tensor without an offset.
         """
         if not self.inverse_depth_offset:
             return depth
         relative = 1 + self.inverse_depth_offset * depth  # inverse depth, true over measured
-        return torch.where(relative > 0, depth / relative, 0.0)
+        return torch.where((relative > 0) & depth.isfinite(), depth / relative, 0.0)
 
     def distort(self, uv: Tensor) -> Tensor:
         """Map undistorted pixels to distorted pixels; the inverse of `undistort`.
@@ -249,10 +249,9 @@ class PinholeCamera:
     def undistorted_bounds(self) -> tuple[float, float, float, float]:
         """Undistorted pixels that the image covers: minimum u and v, inclusive, and maximum u and v, exclusive.
 
-        The undistorted image of a fisheye lens is much larger than the recorded image; for other lenses, the two have
-        about the same size.
+        The undistorted image of a wide lens is much larger than the recorded image.
         """
-        if self.distortion_model != "equidistant":
+        if not self.is_distorted:
             return 0.0, 0.0, float(self.width), float(self.height)
         low, high = (self._normalised_bounds * self.focal_lengths + self._principal_point).tolist()
         return low[0], low[1], high[0], high[1]

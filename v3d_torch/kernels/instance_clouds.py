@@ -56,6 +56,8 @@ def instance_cloud(
                 count += 1
             ray += 1
     means, _, voxels = pool_voxels(points[:count], voxel_size, np.inf)
+    if len(means) == 0:  # also if a point is not finite: it has no voxel
+        return means, np.zeros(0, np.bool_)
     selected = _select_largest(dbscan(means.astype(np.float64), eps, min_samples))
     for i in range(count):
         if selected[voxels[i]]:

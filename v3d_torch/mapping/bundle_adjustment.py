@@ -24,7 +24,7 @@ from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
 from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
-from v3d_torch.optim.schur import REGULARISATION
+from v3d_torch.optim.schur import SCHUR_REGULARISATION
 from v3d_torch.runtime.batches import from_rows, to_rows
 
 _Array = NDArray[Any]
@@ -193,7 +193,7 @@ def _minimise_compiled(
     batch = fixed.shape[:-1]
     if 0 in batch:
         return NotImplemented
-    settings = iterations, tolerance, REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
+    settings = iterations, tolerance, SCHUR_REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
     problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
     results = []
     for T, X, (order, problem) in zip(to_rows(T_cw, batch), to_rows(points, batch), problems, strict=True):

@@ -21,8 +21,12 @@ from v3d_torch.runtime.tensor_table import TensorTable
 Columns = Mapping[str, Tensor]
 """Columns by ``group/name``. The columns of one group have the same number of rows."""
 
-OPTIONAL_COLUMNS = ("feature/sigma_ratio", "observation/sigma_ratio")
-"""Columns that are stored only if a value differs from one, which is the value of files without them."""
+OPTIONAL_COLUMNS: Columns = {
+    "feature/sigma_ratio": torch.ones(2, dtype=torch.float64),
+    "observation/sigma_ratio": torch.ones(2, dtype=torch.float64),
+    "view/T_dc": torch.eye(4, dtype=torch.float64),
+}
+"""Columns that are stored only if a row differs from this one, which all rows have in files without the column."""
 
 _MIN_SIGMA_RATIO = torch.finfo(torch.float64).tiny
 """Smallest positive number: standard deviations are not zero."""
@@ -69,6 +73,7 @@ def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
             "keyframe": torch.tensor([view.keyframe.index for view in views], dtype=torch.int64),
             "depth_units": torch.cat(depth_units),
             "colour": torch.cat(colours),
+            "T_dc": torch.cat([torch.zeros(0, 4, 4, dtype=torch.float64), *(view.T_dc[None] for view in views)]),
         },
     }
     return {f"{group}/{name}": column for group, columns in groups.items() for name, column in columns.items()}
@@ -103,8 +108,9 @@ def fill_from_columns(columns: Columns, tables: MapTables, views: StaticViews) -
     loops, stored = _select_group(columns, "loop"), _select_group(columns, "view")
     for i, j, T_ij in zip(loops["i"].tolist(), loops["j"].tolist(), loops["T_ij"], strict=True):
         tables.loops.append(Loop(i, j, T_ij))
-    for index, units, colour in zip(stored["keyframe"].tolist(), stored["depth_units"], stored["colour"], strict=True):
-        views.append(StaticView(tables.keyframes[index], units, colour))
+    images = stored["depth_units"], stored["colour"], stored["T_dc"]
+    for index, units, colour, T_dc in zip(stored["keyframe"].tolist(), *images, strict=True):
+        views.append(StaticView(tables.keyframes[index], units, colour, T_dc))
 
 
 def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticViews) -> str | None:
@@ -152,7 +158,7 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
     ):
         if not bool(((columns[name] >= minimum) & (columns[name] < end)).all()):
             return f"{name} has values out of range"
-    for name in ("keyframe/T_cw", "loop/T_ij"):
+    for name in ("keyframe/T_cw", "loop/T_ij", "view/T_dc"):
         if not _are_rigid_motions(columns[name]):
             return f"{name} has matrices that are not rigid motions"
     reference = columns["keyframe/reference"]

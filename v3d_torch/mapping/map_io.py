@@ -80,7 +80,7 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
     stored = {
         name: column.numpy()
         for name, column in columns.items()
-        if name not in OPTIONAL_COLUMNS or bool((column != 1).any())
+        if name not in OPTIONAL_COLUMNS or bool((column != OPTIONAL_COLUMNS[name]).any())
     }
     write_array_file(Path(path), about, stored)
 
@@ -121,9 +121,10 @@ def _read_columns(file: ArrayFile, names: Iterable[str]) -> dict[str, Tensor]:
             columns[name] = torch.from_numpy(file.read("keyframe/disconnected")).to(torch.int64)
         elif name in file or name not in OPTIONAL_COLUMNS:
             columns[name] = torch.from_numpy(file.read(name))
-    for name in OPTIONAL_COLUMNS:
-        uv = columns[f"{name.split('/')[0]}/uv"]
-        columns.setdefault(name, torch.ones_like(uv))
+    for name in OPTIONAL_COLUMNS.keys() - columns.keys():
+        group, default = name.split("/")[0], OPTIONAL_COLUMNS[name]
+        rows = next(len(column) for other, column in columns.items() if other.startswith(f"{group}/"))
+        columns[name] = default.repeat(rows, *(1,) * default.ndim)
     return columns
 
 

@@ -18,7 +18,7 @@ from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_adjustment import sort_by_point
 from v3d_torch.mapping.bundle_problem import NEGLIGIBLE_DAMPING, BundleProblem, prepare_bundle
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
-from v3d_torch.optim.schur import REGULARISATION
+from v3d_torch.optim.schur import SCHUR_REGULARISATION
 from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
 
 _PRIOR_WEIGHT = 0.85
@@ -152,7 +152,7 @@ def _reduced_cost_derivatives_compiled(
         return NotImplemented
     problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
     poses, landmarks, derivatives = to_rows(T_cw, batch), to_rows(points, batch), to_rows(derivative.mT, batch)
-    settings = NEGLIGIBLE_DAMPING, REGULARISATION, MIN_DEPTH
+    settings = NEGLIGIBLE_DAMPING, SCHUR_REGULARISATION, MIN_DEPTH
     results = [
         kernels.reduced_cost_derivatives(T, X, *problem, j[order], *settings)
         for T, X, j, (order, problem) in zip(poses, landmarks, derivatives, problems, strict=True)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import STORED_UNIT
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
 
 
@@ -21,27 +21,30 @@ class StaticView:
     """Static depth and colour image of one keyframe.
 
     Attributes:
-        keyframe: Keyframe whose pose is the pose of the view.
+        keyframe: Keyframe from whose frame the images are.
         depth_units: Depth in units of `STORED_UNIT`, 0 = no measurement or not static, uint16,
             shape :math:`(h, w)`.
         colour: RGB, uint8, shape :math:`(3, h, w)`.
+        T_dc: Motion of the camera from the time of the colour image to that of the depth image: it maps points of the
+            camera frame "c" at the former to "d" at the latter, float64, shape :math:`(4, 4)`.
         depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
     """
 
     keyframe: Keyframe
     depth_units: Tensor
     colour: Tensor
+    T_dc: Tensor
     depth_delay: float = 0.0
 
     @property
-    def T_cw(self) -> Tensor:
-        """World-to-camera pose, float64, shape :math:`(4, 4)`."""
-        return self.keyframe.T_cw
+    def T_dw(self) -> Tensor:
+        """World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`."""
+        return self.T_dc @ self.keyframe.T_cw
 
     @property
-    def T_wc(self) -> Tensor:
-        """Camera-to-world pose, float64, shape :math:`(4, 4)`."""
-        return invert(self.keyframe.T_cw)
+    def T_wd(self) -> Tensor:
+        """Camera-to-world pose at the time of the depth image, float64, shape :math:`(4, 4)`."""
+        return invert(self.T_dw)
 
     @property
     def depth(self) -> Tensor:
@@ -68,6 +71,7 @@ class StaticViews:
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
         self.stride = stride
+        self._depth_delay = camera.depth_delay
         self.camera = PinholeCamera(
             fx=camera.fx / stride,
             fy=camera.fy / stride,
@@ -102,20 +106,31 @@ class StaticViews:
         views._views = [view for view in self if not view.keyframe.is_disconnected]
         return views
 
-    def add(self, keyframe: Keyframe, image: Tensor, depth: Tensor, static: Tensor, depth_delay: float = 0.0) -> None:
+    def add(
+        self,
+        keyframe: Keyframe,
+        image: Tensor,
+        depth: Tensor,
+        static: Tensor,
+        depth_delay: float = 0.0,
+        twist: Tensor | None = None,
+    ) -> None:
         """Store the static pixels of a keyframe as a view.
 
         Args:
-            keyframe: Keyframe whose pose is the pose of the view.
+            keyframe: Keyframe from whose frame the images are.
             image: RGB image, uint8, shape :math:`(3, H, W)`.
             depth: Depth image, metres, shape :math:`(1, H, W)`.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
-            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
+            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds; the
+                camera's own delay is added.
+            twist: Twist of the camera at the time of the colour image, see `CameraState`; None for a camera at rest.
         """
+        motion = torch.zeros(6, dtype=torch.float64) if twist is None else twist * (depth_delay + self._depth_delay)
         units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
         units = torch.where(keep, units, 0).to(torch.uint16)
-        self.append(StaticView(keyframe, units, image[:, self._v, self._u], depth_delay))
+        self.append(StaticView(keyframe, units, image[:, self._v, self._u], se3_exp(-motion), depth_delay))
 
     def append(self, view: StaticView) -> None:
         """Append a view, and remove the views of keyframes that were culled.

@@ -72,8 +72,9 @@ def _compute_clouds_compiled(
     depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig
 ) -> InstanceClouds:
     # No cloud is wider than this; the kernels can number only this many cells.
-    max_width = 2 * config.max_depth * max(float(np.abs(rays).max()), 1.0)
-    if depth.dtype != torch.float32 or max_width > MAX_CELLS / 2 * min(config.eps, config.voxel_size):
+    max_width = 2 * config.max_depth * float(np.maximum(np.abs(rays).max(), 1.0))
+    is_numbered = max_width <= MAX_CELLS / 2 * min(config.eps, config.voxel_size)  # false if a ray is NaN
+    if depth.dtype != torch.float32 or not is_numbered:
         return NotImplemented
     parameters = np.float32(config.max_depth), np.float32(config.voxel_size), config.eps, config.min_samples
     z, cloud_pixels = to_array(depth), np.zeros(masks.shape, np.bool_)

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Mapping
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
@@ -66,7 +67,14 @@ class OccupancyMapper:
         self._rebuilt: OccupancyMap | None = None
         self._rebuilt_views = 0
 
-    def __call__(self, depth: Tensor, static: Tensor, poses: PoseHistory, up: UpDirection | None = None) -> None:
+    def __call__(
+        self,
+        depth: Tensor,
+        static: Tensor,
+        poses: PoseHistory,
+        up: UpDirection | None = None,
+        T_dc: Tensor | None = None,
+    ) -> None:
         """Add a frame, if it is due and its pose is known.
 
         Args:
@@ -74,13 +82,15 @@ class OccupancyMapper:
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
             poses: Poses of all frames up to this one.
             up: Up direction as it is known now; None if nothing new is known.
+            T_dc: Motion of the camera from the time of the colour image to that of the depth image, float64, shape
+                :math:`(4, 4)`; None if both are simultaneous.
         """
         self.up = up or self.up
         frame = len(poses) - 1
         if frame % self._config.interval != 0 or not poses.is_located:
             return
         view = RangeView.sample(self._count, depth[0], static, self._config.stride)
-        self._store.append(view, frame, poses.T_cw)
+        self._store.append(view, frame, poses.T_cw, torch.eye(4, dtype=torch.float64) if T_dc is None else T_dc)
         self._count += 1
         self._integrate(self.map, len(self._store) - 1)
         if (kept := self._store.reduce()) is not None:
@@ -146,12 +156,12 @@ class OccupancyMapper:
 
     def _begin_rebuild(self, poses: PoseHistory) -> None:
         """Begin a rebuild if a view has moved too far."""
-        T_cw = poses.poses_of(self._store.frames)
-        moved = displacement(T_cw, self._store.T_cw)
+        T_dw = self._store.T_dc @ poses.poses_of(self._store.frames)
+        moved = displacement(T_dw, self._store.T_dw)
         if not (moved > _MAX_DISPLACEMENT * self._config.voxel_size).any():
             return
         _LOG.info("occupancy map: rebuilt from %d views, which moved by up to %.3f m", len(moved), float(moved.max()))
-        self._store.T_cw = T_cw
+        self._store.T_dw = T_dw
         self._rebuilt, self._rebuilt_views = OccupancyMap(self._config), 0
 
     def _continue_rebuild(self, count: int) -> None:
@@ -172,4 +182,4 @@ class OccupancyMapper:
         """Add a stored view to a map."""
         view = self._store.views[position]
         rays = view.rays(self._camera, self._config.stride)
-        occupancy.integrate(view.depth, view.static, rays, invert(self._store.T_cw[position]))
+        occupancy.integrate(view.depth, view.static, rays, invert(self._store.T_dw[position]))

@@ -38,8 +38,10 @@ class ViewStore:
     Attributes:
         views: Views.
         frames: Position of each view's frame in the pose history.
-        T_cw: World-to-camera pose with which each view was added to the occupancy map, float64, shape
-            :math:`(N, 4, 4)`.
+        T_dc: Motion of the camera from the time of the colour image to that of the depth image of each view, float64,
+            shape :math:`(N, 4, 4)`.
+        T_dw: World-to-camera pose at the time of the depth image, with which each view was added to the occupancy map,
+            float64, shape :math:`(N, 4, 4)`.
         has_removed_far: True if views were removed because they were far from the camera, so that the other views do
             not show all places.
     """
@@ -48,21 +50,25 @@ class ViewStore:
         self._capacity = capacity
         self.views: list[RangeView] = []
         self.frames: list[int] = []
-        self.T_cw = torch.zeros(0, 4, 4, dtype=torch.float64)
+        self.T_dc = torch.zeros(0, 4, 4, dtype=torch.float64)
+        self.T_dw = torch.zeros(0, 4, 4, dtype=torch.float64)
         self.has_removed_far = False
 
     def __len__(self) -> int:
         return len(self.views)
 
-    def append(self, view: RangeView, frame: int, T_cw: Tensor) -> None:
+    def append(self, view: RangeView, frame: int, T_cw: Tensor, T_dc: Tensor) -> None:
         """Append a view.
 
         Args:
             view: View.
             frame: Position of its frame in the pose history.
-            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            T_cw: World-to-camera pose of the frame, float64, shape :math:`(4, 4)`.
+            T_dc: Motion of the camera from the time of the colour image to that of the depth image, float64, shape
+                :math:`(4, 4)`.
         """
-        self.T_cw = torch.cat([self.T_cw, T_cw[None]])
+        self.T_dc = torch.cat([self.T_dc, T_dc[None]])
+        self.T_dw = torch.cat([self.T_dw, (T_dc @ T_cw)[None]])
         self.views.append(view)
         self.frames.append(frame)
 
@@ -80,31 +86,32 @@ class ViewStore:
             cell = 2 * cell
             kept = self._newest_per_cell(cell)
         if int(kept.sum()) > limit:
-            centres = invert(self.T_cw)[:, :3, 3]
+            centres = invert(self.T_dw)[:, :3, 3]
             order = torch.nonzero(kept)[:, 0]
             order = order[(centres[order] - centres[-1]).norm(dim=1).argsort(stable=True)]
             kept[order[limit:]] = False
             self.has_removed_far = True
             _LOG.warning("occupancy map: the %d views farthest from the camera were removed", len(order) - limit)
-        self.T_cw = self.T_cw[kept]
+        self.T_dc, self.T_dw = self.T_dc[kept], self.T_dw[kept]
         self.views = [view for view, keep in zip(self.views, kept.tolist(), strict=True) if keep]
         self.frames = [frame for frame, keep in zip(self.frames, kept.tolist(), strict=True) if keep]
         return kept
 
     def state_dict(self) -> dict[str, Any]:
         """Return the views."""
-        own = {"views": self.views, "frames": self.frames, "T_cw": self.T_cw}
+        own = {"views": self.views, "frames": self.frames, "T_dc": self.T_dc, "T_dw": self.T_dw}
         return {**own, "has_removed_far": self.has_removed_far}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the views of `state_dict`."""
-        self.views, self.frames, self.T_cw = list(state["views"]), list(state["frames"]), state["T_cw"]
+        self.views, self.frames = list(state["views"]), list(state["frames"])
+        self.T_dc, self.T_dw = state["T_dc"], state["T_dw"]
         self.has_removed_far = state["has_removed_far"]
 
     def _newest_per_cell(self, side: float) -> Tensor:
         """Mask of the newest view in each cell of poses, bool, (N,)."""
-        T_wc = invert(self.T_cw)
-        pose = torch.cat([T_wc[:, :3, 3], LEVER * T_wc[:, :3, 1], LEVER * T_wc[:, :3, 2]], dim=1)
+        T_wd = invert(self.T_dw)
+        pose = torch.cat([T_wd[:, :3, 3], LEVER * T_wd[:, :3, 1], LEVER * T_wd[:, :3, 2]], dim=1)
         _, cell = (pose / side).floor().unique(dim=0, return_inverse=True)
         newest = torch.zeros(len(self), dtype=torch.int64).scatter_reduce(0, cell, torch.arange(len(self)), "amax")
         return newest[cell] == torch.arange(len(self))

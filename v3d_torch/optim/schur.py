@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-REGULARISATION = 1e-6
+SCHUR_REGULARISATION = 1e-6
 """Number added to all diagonals, which makes blocks without observations solvable. It is small compared with the
 information of an observation across its ray: 3e2 per square metre for a feature of the coarsest pyramid level at 8 m,
 at a focal length of 525 pixels."""
@@ -120,7 +120,7 @@ def _damp(blocks: Tensor, damping: Tensor | float) -> Tensor:
     """Blocks (..., n, n, count) with damped diagonals."""
     diagonal = torch.eye(blocks.shape[-2], dtype=blocks.dtype, device=blocks.device)[..., None]
     factor = torch.as_tensor(damping, dtype=blocks.dtype, device=blocks.device)[..., None, None, None]
-    return blocks + diagonal * (factor * blocks + REGULARISATION)
+    return blocks + diagonal * (factor * blocks + SCHUR_REGULARISATION)
 
 
 def _factorise(V: Tensor) -> tuple[Tensor, Tensor]:

@@ -149,12 +149,12 @@ def _observe(
 
     The weight is the inverse squared depth, and 0 where the view observes another surface, or this one from behind.
     """
-    in_camera = transform_points(view.T_cw, points)
+    in_camera = transform_points(view.T_dw, points)
     pixels, inside = views.camera.project_to_image(in_camera, config.mesh.voxel_size)
     u, v = pixels.round().to(torch.int64).unbind(dim=1)
     u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
     z = in_camera[:, 2]
     depth = view.depth[v, u]
-    is_front = ((view.T_wc[:3, 3] - points) * normals).sum(dim=1) > 0
+    is_front = ((view.T_wd[:3, 3] - points) * normals).sum(dim=1) > 0
     observed = inside & (depth > 0) & ((depth - z).abs() < config.mesh.truncation) & is_front
     return torch.where(observed, 1 / z.square(), 0.0), u, v

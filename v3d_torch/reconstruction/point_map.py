@@ -83,9 +83,9 @@ def _point_rows(view: StaticView, views: StaticViews, config: Config) -> Tensor:
     normals = surface_normals(back_project(smooth, views.rays))[0]
     keep = (normals != 0).any(dim=-1) & (depth[0, 0] <= config.dense_map.max_depth)
     points = back_project(depth, views.rays)[0][keep].to(torch.float64)
-    normals_w = normals[keep].to(torch.float64) @ view.T_wc[:3, :3].T
+    normals_w = normals[keep].to(torch.float64) @ view.T_wd[:3, :3].T
     colours = view.colour.permute(1, 2, 0)[keep].to(torch.float64)
-    return torch.cat([transform_points(view.T_wc, points), colours, normals_w], dim=1)
+    return torch.cat([transform_points(view.T_wd, points), colours, normals_w], dim=1)
 
 
 def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) -> tuple[Tensor, Tensor]:
@@ -124,7 +124,7 @@ def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfi
     free, occupied, free_since = torch.zeros(3, len(centres), dtype=torch.int32)  # since the last observed surface
     blocks = PointBlocks(centres)
     for view in views:
-        depth_view = DepthView(view.keyframe.stamp, view.depth[None], view.T_cw)
+        depth_view = DepthView(view.keyframe.stamp, view.depth[None], view.T_dw)
         rows = blocks.observable_by(depth_view, views.camera, config)
         state = is_free_space(centres[rows], depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
         free[rows] += state == 1

@@ -40,7 +40,7 @@ def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
         valid = (depth > 0) & (depth <= config.max_depth)
         points = back_project(depth[None, None], views.rays)[0][valid].to(torch.float64)
         offset = config.mesh.truncation * points / points.norm(dim=1, keepdim=True)
-        points = transform_points(view.T_wc, torch.cat([points - offset, points, points + offset]))
+        points = transform_points(view.T_wd, torch.cat([points - offset, points, points + offset]))
         blocks = (points / (BLOCK * config.mesh.voxel_size)).floor().to(torch.int64)
         found.append(cell_keys(blocks).unique())
     return cells_of_keys(torch.cat(found).unique())
@@ -81,7 +81,7 @@ def _blocks_in_view(corners: Tensor, view: StaticView, views: StaticViews, confi
     """Rows of the blocks, given by their first corners, whose bounding spheres intersect the viewing frustum."""
     side = (BLOCK - 1) * config.mesh.voxel_size
     radius = 0.5 * 3**0.5 * side
-    x, y, z = transform_points(view.T_cw, corners + 0.5 * side).unbind(dim=1)
+    x, y, z = transform_points(view.T_dw, corners + 0.5 * side).unbind(dim=1)
     camera = views.camera
     inside = z > -radius
     for position, focal, first, last in (
@@ -97,8 +97,8 @@ def _measure(
     corners: Tensor, offsets: Tensor, view: StaticView, views: StaticViews, config: DenseMapConfig
 ) -> tuple[Tensor, Tensor]:
     """Truncated distances and weights of the voxels of blocks in one view, float32, shape (n, 512) each."""
-    R_cw, t_cw = view.T_cw[:3, :3], view.T_cw[:3, 3]
-    base, step = (corners @ R_cw.T + t_cw).to(torch.float32), (offsets @ R_cw.T).to(torch.float32)
+    base = transform_points(view.T_dw, corners).to(torch.float32)
+    step = (offsets @ view.T_dw[:3, :3].T).to(torch.float32)
     x, y, z = (base[:, None, axis] + step[:, axis] for axis in range(3))
     camera = views.camera
     inverse_z = 1 / z.clamp(min=config.mesh.voxel_size)

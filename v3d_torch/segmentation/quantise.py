@@ -95,7 +95,9 @@ def quantise(path: Path, images: Iterable[Tensor], target: Path) -> None:
         def get_next(self) -> dict[str, NDArray[np.float32]] | None:
             return next(canvases, None)
 
-    logging.disable(logging.WARNING)  # onnxruntime recommends a fusion that the exporter has already done
+    disabled = logging.root.manager.disable
+    # onnxruntime recommends a fusion that the exporter has already done.
+    logging.disable(max(disabled, logging.WARNING))
     try:
         quantize_static(
             str(path),
@@ -109,7 +111,7 @@ def quantise(path: Path, images: Iterable[Tensor], target: Path) -> None:
             weight_type=QuantType.QInt8,
         )
     finally:
-        logging.disable(logging.NOTSET)
+        logging.disable(disabled)
     quantised = onnx.load(target)
     _fuse_activations(quantised)
     onnx.save(quantised, target)

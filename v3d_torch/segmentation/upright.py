@@ -6,8 +6,9 @@ upright one gives the detections with the highest scores. In a search, each turn
 frame. As the camera turns, correct votes add up and wrong votes cancel out. A few searches suffice, because the camera
 poses relate the up direction to each new frame.
 
-The first search segments all turns of one image. A later search takes three images, and segments each of them upright
-and in one other turn, so that a live camera does not wait for four images at once.
+The first image is segmented in all turns. Each search then takes three images, and segments each of them upright and in
+one other turn, so that a live camera does not wait for four images at once. The first search is that of the next three
+images.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ _CONFIDENT_WEIGHT = 10.0
 votes can no longer change it."""
 
 _SEARCH_INTERVAL = 8
-"""Number of calls between two searches until the up direction is settled: a quarter of a second at 30 Hz, so that a
-moving camera has a different view at each search."""
+"""Number of calls between two searches until the up direction is settled: a quarter of a second at 30 Hz, so that
+the view of a moving camera has changed. Searches also begin after each power of two of calls, from 4 on."""
 
 _SEARCH_CALLS = 128
 """Number of calls during which searches are this frequent, about 4 s at 30 Hz. It bounds the cost in scenes without
@@ -123,7 +124,8 @@ class UprightSegmenter:
         if turns == 0:
             return self.wrapped(frame)
         image, depth = (torch.rot90(values, turns, dims=(1, 2)).contiguous() for values in (frame.image, frame.depth))
-        instances = self.wrapped(replace(frame, image=image, depth=depth))
+        # Gravity and camera are those of the image before its rotation.
+        instances = self.wrapped(replace(frame, image=image, depth=depth, gravity=None, camera=None))
         for _ in range(turns):
             instances = _rotate_clockwise(instances)
         return instances
