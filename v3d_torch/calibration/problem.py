@@ -223,7 +223,7 @@ class SelfCalibration:
             measured,
             uv=uv + (readout - self._readout) * self._readout_jacobian,
             inverse_depth=torch.where(measured.inverse_depth > 0, measured.inverse_depth + change, 0.0),
-            pixel_sigma=scale / self._scale * measured.pixel_sigma,  # the noise was estimated with the first camera
+            pixel_sigma=scale * measured.pixel_sigma,
         )
         return replace(self.observations, measured=changed), camera
 
@@ -231,11 +231,12 @@ class SelfCalibration:
         """Return the observations with standard deviations estimated from their residuals in the given map."""
         measured = self.observations.measured
         residuals = _whitened_residuals(self.observations, self._camera, self.T_cw, self.points).abs()
+        in_image = residuals[:2] / self._scale  # in the recorded image
         depth = residuals[2, measured.inverse_depth > 0]
         freedom = math.sqrt(self.residual_count / max(self.residual_count - self.unknown_count, 1))
         pixel, inverse_depth = (
             float(errors.median()) * freedom / _NORMAL_MAD if len(errors) else 1.0
-            for errors in (residuals[:2].flatten(), depth)
+            for errors in (in_image.flatten(), depth)
         )
         estimated = replace(
             measured,
