@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 _BIN = 5e-5
-"""Width of the bins of inverse depth, 1/m: a tenth of the finest step, and a tenth of a millimetre at 1.5 m."""
+"""Width of the bins of inverse depth, 1/m: an eighth of the finest step, and a tenth of a millimetre at 1.5 m."""
 
 _MAX_INVERSE_DEPTH = 8.0
 """Maximum inverse depth, 1/m: a depth of 0.125 m."""

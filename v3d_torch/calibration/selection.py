@@ -51,7 +51,7 @@ class Estimate:
         name: Name of the parameter.
         given: Value of the given camera; None if it states none.
         value: Estimated value; NaN if there is none.
-        sigma: Standard deviation of the estimate; infinite if the recording does not determine the parameter.
+        sigma: Standard deviation of the estimate; infinite if there is none.
         accepted: True if the estimate replaces the given value.
         reason: Reason why the given value was kept; empty if it was replaced.
     """

@@ -33,7 +33,7 @@ def select_corners(
             first one is selected.
         image: Index of the image of each corner, int64, shape :math:`(N,)`.
         sizes: Width and height of the M images, pixels.
-        counts: Number of corners to select in each image; the division of the last cell can add up to three more.
+        counts: Number of corners to select in each image; the division of the last cell can add up to two more.
 
     Returns:
         Indices of the selected corners, sorted by image, int64, shape :math:`(K,)`.

@@ -66,7 +66,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     check_positive(sigma=sigma)
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     if kernel_size < 1 or kernel_size % 2 == 0:
-        raise ConfigError(f"depth.kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
+        raise ConfigError(f"kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
     radius = kernel_size // 2
     taps, height = _gaussian(kernel_size, sigma), depth.shape[-2]
     wide = depth.to(working_dtype(depth.dtype))  # half precision cannot represent the placeholder

@@ -31,7 +31,8 @@ def depth_to_metres(depth: NDArray[Any], depth_scale: float | None) -> Tensor:
 
     Args:
         depth: Depth image, shape (H, W): metres in floating point, or whole numbers in units of the depth scale. Values
-            that are not positive or not finite, and the largest 16-bit value, are not measurements.
+            that are not positive or not finite, the largest value of uint16, and floating-point depth above 10 km are
+            not measurements.
         depth_scale: Units per metre of whole numbers; None only for floating point.
 
     Returns:

@@ -38,7 +38,8 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     Args:
         points: Points in the camera frame, metres, one per pixel, shape :math:`(B, H, W, 3)`; z = 0, NaN or infinite
             for pixels without measurement.
-        radius: Half the side of the window, pixels; every other row and column of the window is used.
+        radius: Half the side of the window, pixels; every other row and column of the window is used, from its
+            border on.
         edge_ratio: Pixels whose depths differ by more than this fraction lie on different surfaces.
 
     Returns:

@@ -28,7 +28,7 @@ def _choose_cells(begins: Ints, depth: int, count: int) -> NDArray[np.bool_]:
     Args:
         begins: First level on which each corner begins a cell, in the order of their cells, (N,), at least one corner.
         depth: Deepest level.
-        count: Number of cells.
+        count: Number of corners to select.
     """
     begun = np.zeros(depth + 2, np.int64)
     for level in begins:

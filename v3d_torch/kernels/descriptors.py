@@ -87,7 +87,7 @@ def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) ->
         a: Descriptors, (N, 4).
         b: Descriptors, (M, 4).
         max_hamming: Maximum Hamming distance, bits.
-        max_ratio: Maximum ratio of the best to the second-best distance.
+        max_ratio: The best distance is less than this fraction of the second-best.
     """
     pairs, count = np.empty((len(a), 2), np.int64), 0
     rows, columns = a.T.copy(), b.T.copy()

@@ -18,7 +18,7 @@ _MIN_SQUARE = 1e-30
 
 
 @device
-def _compose(U: Array, V: Array, K_inverse: Array) -> Array:
+def _fundamental(U: Array, V: Array, K_inverse: Array) -> Array:
     """Fundamental matrix of the rotations U and V."""
     E = np.empty((3, 3))
     for i in range(3):
@@ -41,7 +41,7 @@ def _tangents(U: Array, V: Array, K_inverse: Array) -> Array:
             turned[0, j] = axis[1] * z - axis[2] * y
             turned[1, j] = axis[2] * x - axis[0] * z
             turned[2, j] = axis[0] * y - axis[1] * x
-        G[k] = _compose(turned, V, K_inverse) if k < 3 else _compose(U, turned, K_inverse)
+        G[k] = _fundamental(turned, V, K_inverse) if k < 3 else _fundamental(U, turned, K_inverse)
     return G
 
 
@@ -65,7 +65,7 @@ def _linearise(
     U: Array, V: Array, K_inverse: Array, a: Array, b: Array, weights: Array, active: Mask, H: Array, g: Array
 ) -> float:
     """Return the cost of the active pairs; write the normal equations."""
-    F, G, J, cost = _compose(U, V, K_inverse), _tangents(U, V, K_inverse), np.empty(5), 0.0
+    F, G, J, cost = _fundamental(U, V, K_inverse), _tangents(U, V, K_inverse), np.empty(5), 0.0
     H[:], g[:] = 0.0, 0.0
     for i in range(len(a)):
         if not active[i]:
@@ -89,7 +89,7 @@ def _classify(
     U: Array, V: Array, K_inverse: Array, a: Array, b: Array, valid: Mask, threshold: float, inliers: Mask
 ) -> bool:
     """Write the mask of valid pairs within the threshold; return True if it did not change."""
-    F, unchanged = _compose(U, V, K_inverse), True
+    F, unchanged = _fundamental(U, V, K_inverse), True
     for i in range(len(a)):
         product, b0, b1, a0, a1 = _constraint(F, a[i], b[i])
         length = _length(a0, a1, b0, b1)

@@ -108,7 +108,7 @@ class OptimisationResult(Generic[State, System]):
         cost_before: Costs of the initial states, shape :math:`(...)`.
         cost_after: Costs of ``state``, shape :math:`(...)`.
         iterations: Number of steps tried for each problem, int64, shape :math:`(...)`.
-        converged: Mask of the problems that converged, bool, shape :math:`(...)`.
+        converged: Mask of the problems that converged, or were finished from the start, bool, shape :math:`(...)`.
     """
 
     state: State

@@ -210,7 +210,11 @@ def _run(session: onnxruntime.InferenceSession, inputs: dict[str, _Array], path:
 
 
 def open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
-    """Load a network into onnxruntime, deterministic and on the CPU."""
+    """Load a network into onnxruntime, deterministic and on the CPU.
+
+    Raises:
+        WeightsError: If the file is missing, or not a network that onnxruntime can load.
+    """
     if not path.is_file():
         raise WeightsError(f"{path}: no such file; check the path given with --weights")
     ort = import_onnxruntime()

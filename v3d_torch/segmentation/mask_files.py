@@ -82,7 +82,8 @@ class MaskFolder:
         """Return the instances of a frame in the order of their ids, each with the score 1.
 
         Raises:
-            InputError: If the frame has no id image, or the image is unreadable or of another size.
+            InputError: If the frame has no id image, or the image is unreadable, of another size or of several
+                channels, or has too many ids.
         """
         return self.read(frame)[0]
 
@@ -90,7 +91,8 @@ class MaskFolder:
         """Return the instances of a frame and their ids in the file, int64, shape :math:`(N,)`.
 
         Raises:
-            InputError: If the frame has no id image, or the image is unreadable or of another size.
+            InputError: If the frame has no id image, or the image is unreadable, of another size or of several
+                channels, or has too many ids.
         """
         path = self._find_path(frame)
         values = _read_ids(path)
