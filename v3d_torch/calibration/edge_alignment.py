@@ -283,7 +283,7 @@ def _t_statistic(values: Tensor, cluster: Tensor) -> float:
 
 
 def _ascent_step(gradient: Tensor, hessian: Tensor) -> Tensor:
-    """Newton step towards a maximum: uphill also where the curvature is positive, and at most one unit along each axis."""
+    """Newton step to a maximum: uphill also where the curvature is positive, at most one unit along each axis."""
     curvature, directions = torch.linalg.eigh(hessian)
     step = directions @ (directions.T @ gradient / curvature.abs().clamp(min=1e-9))
     return step / max(float(step.abs().max()), 1.0)
