@@ -37,6 +37,16 @@ def test_frames_are_listed_at_once(tmp_path: Path) -> None:
         assert (tmp_path / "out" / "depth.txt").read_text().splitlines()[-1] == f"{last} depth/{last}.png"
 
 
+def test_depth_images_with_the_same_stamp_are_kept(tmp_path: Path) -> None:
+    image, depth = torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8), torch.ones(1, HEIGHT, WIDTH)
+    with TUMWriter(tmp_path / "out", PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT, depth_scale=1000)) as writer:
+        writer.add(RGBDFrame(0, 1.0, image, 2 * depth, depth_delay=0.01))
+        writer.add(RGBDFrame(1, 1.01, image, 3 * depth))
+    first, second = load_sequence(str(tmp_path / "out"))
+    assert torch.equal(first.depth, 2 * depth) and torch.equal(second.depth, 3 * depth)
+    assert (first.depth_delay, second.depth_delay) == (pytest.approx(0.01), 0)
+
+
 def test_source_without_frames_leaves_the_folder_empty(tmp_path: Path) -> None:
     with TUMWriter(tmp_path / "out", PinholeCamera(1, 2, 3, 4, WIDTH, HEIGHT)):
         pass

@@ -71,18 +71,21 @@ class TUMWriter:
     def add(self, frame: RGBDFrame) -> None:
         """Write the images of a frame, list them, and write the gravity of the first frame if it was measured.
 
-        Depth is rounded to units of the depth scale; beyond the 16-bit range, it is written as 0, no measurement.
+        Depth is rounded to units of the depth scale; beyond the 16-bit range, it is written as 0, no measurement. The
+        name of each image is its stamp; the depth image of a later frame with the same depth stamp has both stamps.
         """
         if not self._count:
             self._write_camera()
             if frame.gravity is not None:
                 write_gravity_file(self.folder, frame.stamp, frame.gravity)
         rgb, depth = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
-        listed_rgb, listed_depth = f"{rgb} rgb/{rgb}.png", f"{depth} depth/{depth}.png"
+        is_taken = (self.folder / "depth" / f"{depth}.png").exists()  # by an earlier frame: the folder was empty
+        depth_name = f"{depth}_{rgb}" if is_taken else depth
+        listed_rgb, listed_depth = f"{rgb} rgb/{rgb}.png", f"{depth} depth/{depth_name}.png"
         units, out_of_range = depth_to_units(frame.depth, self._depth_scale)
         self._out_of_range += out_of_range
         write_png(self.folder / "rgb" / f"{rgb}.png", frame.image.permute(1, 2, 0).numpy())
-        write_png(self.folder / "depth" / f"{depth}.png", units)
+        write_png(self.folder / "depth" / f"{depth_name}.png", units)
         append_line(self.folder / "rgb.txt", listed_rgb)
         append_line(self.folder / "depth.txt", listed_depth)
         append_line(self.folder / "associations.txt", f"{listed_rgb} {listed_depth}")
