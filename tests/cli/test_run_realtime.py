@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -66,6 +67,19 @@ def test_run_reports_latency_dropped_frames_and_accuracy(sequence: Path, tmp_pat
         assert states[name].max() == pytest.approx(metrics[name]["max"])
     covariances = np.stack(states["covariance"].to_list()).reshape(-1, 6, 6)
     assert np.allclose(covariances, covariances.transpose(0, 2, 1))
+
+
+def test_what_is_known_of_the_stored_sequence_is_reported(sequence: Path, tmp_path: Path) -> None:
+    folder, out = tmp_path / "rgbd_dataset_freiburg3_walking_xyz", tmp_path / "out"
+    shutil.copytree(sequence, folder)
+    (folder / "groundtruth.txt").write_text("1 2 3\n")
+    done = call("--seq", folder, "--segmenter", "none", "--realtime", "--out", out)
+    error = f"{folder / 'groundtruth.txt'}: line 1 is '1 2 3'"
+    assert_error_line(done, error)
+    assert f"note: fr3/w/xyz: the ground truth cannot be read: {error}" in done.stdout
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["difference"] == f"another recording: {FRAMES} frames, not 827"
+    assert error in metrics["diagnosis"] and any(error in warning for warning in metrics["warnings"])
 
 
 def test_masks_from_files_need_no_network(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 from helpers.wall_run import CAMERA, FRAMES, Wall
 
 from v3d_torch.datasets.base import LiveStream
-from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.datasets.realtime_playback import RealtimePlayback, stored_source
 from v3d_torch.errors import InputError
 from v3d_torch.types import RGBDFrame
 
@@ -90,3 +90,8 @@ def test_playback_has_name_camera_and_ground_truth_of_its_source_and_is_live() -
     assert (playback.name, playback.camera, playback.groundtruth) == (wall.name, wall.camera, wall.groundtruth)
     with pytest.raises(InputError, match="wall: is a live camera, which always has its own rate; remove --realtime"):
         RealtimePlayback(playback)
+
+
+def test_stored_source_is_what_a_playback_plays_and_any_other_source_itself() -> None:
+    wall = StoredWall()
+    assert stored_source(RealtimePlayback(wall)) is wall and stored_source(wall) is wall

@@ -86,3 +86,11 @@ class RealtimePlayback:
             following = max(index + 1, min(due, len(stamps) - 1))
             self.skipped += following - index - 1
             index = following
+
+
+def stored_source(source: RGBDStream) -> RGBDStream:
+    """Return the source that a `RealtimePlayback` plays; any other source is returned unchanged.
+
+    A playback is a stream, but what is known of the stored sequence, such as its notes and extent, holds for it too.
+    """
+    return source.source if isinstance(source, RealtimePlayback) else source

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
+from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.sequence_names import find_paper_sequence, short_name
 from v3d_torch.types import Trajectory
 
@@ -76,15 +77,16 @@ EXTENTS = {
 fr3/s/rpy are not included."""
 
 
-def describe_difference(sequence: RGBDStream) -> str | None:
+def describe_difference(source: RGBDStream) -> str | None:
     """Describe how a sequence differs from the sequence of the TUM benchmark that its name contains.
 
     Args:
-        sequence: Sequence, such as ``fr3_walking_xyz_first300``, which is compared with ``fr3/w/xyz``.
+        source: Sequence or its playback, such as ``fr3_walking_xyz_first300``, which is compared with ``fr3/w/xyz``.
 
     Returns:
         Text such as "part: 60 of 827 frames"; None if the sequences agree, or if the extent is not known.
     """
+    sequence = stored_source(source)
     extent = _find_extent(sequence.name)
     if extent is None or not isinstance(sequence, RGBDSequence) or len(sequence) == 0:
         return None

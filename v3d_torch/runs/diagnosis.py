@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets import RGBDSequence
+from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
@@ -125,8 +126,9 @@ def _count_features(pipeline: Pipeline, frame: RGBDFrame) -> int:
 
 def _cause_of_missing_scores(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
     sequence, trajectory = pipeline.sequence, pipeline.slam.poses.trajectory()
-    if isinstance(sequence, StoredSequence) and sequence.groundtruth_error is not None:
-        return str(sequence.groundtruth_error)
+    stored = stored_source(sequence)
+    if isinstance(stored, StoredSequence) and stored.groundtruth_error is not None:
+        return str(stored.groundtruth_error)
     if evaluation is None and sequence.groundtruth is not None and len(trajectory) >= MIN_PAIRS:
         try:
             evaluate(sequence.groundtruth, trajectory)

@@ -8,6 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
+from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.runs.print_line import print_line
@@ -35,7 +36,8 @@ def _load(name: str, data_root: Path | None, console: Console, *, skip_broken: b
 
 def print_notes(source: RGBDStream, console: Console) -> None:
     """Print notes on a source: those of the sequence, and the memory of a run with large images."""
-    notes = source.notes if isinstance(source, StoredSequence) else []
+    stored = stored_source(source)
+    notes = stored.notes if isinstance(stored, StoredSequence) else []
     width, height = source.camera.width, source.camera.height
     if width * height > _MANY_PIXELS:
         gigabytes = width * height * _BYTES_PER_PIXEL / 1e9

@@ -14,6 +14,7 @@ from v3d_torch.config import RollingShutterConfig
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.datasets.image_sequence import ImageSequence
+from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.errors import OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.frame_result import FrameResult
@@ -118,8 +119,9 @@ class Run:
         """
         sequence = self.pipeline.sequence
         _LOG.info("%s: %s frames", sequence.name, len(sequence) if isinstance(sequence, Sized) else "live")
-        if isinstance(sequence, ImageSequence):
-            self.pipeline.warn(sequence.notes)
+        stored = stored_source(sequence)
+        if isinstance(stored, ImageSequence):
+            self.pipeline.warn(stored.notes)
 
         def log_and_save(frame: RGBDFrame, result: FrameResult) -> None:
             motion = describe_motion(result) or "nothing moves"
