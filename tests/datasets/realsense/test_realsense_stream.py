@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -290,6 +291,16 @@ def test_given_camera_has_the_depth_scale_of_the_device_unless_it_states_one() -
     for stated, depth_scale in ((None, 1000), (5000, 5000)):
         stream = RealSenseStream("simulated", SimulatedDevice, replace(given, depth_scale=stated))
         assert stream.camera == replace(given, depth_scale=depth_scale)
+        (frame,) = take_frames(stream, 1)
+        assert float(frame.depth.max()) == pytest.approx(2000 / depth_scale)
+
+
+def test_camera_file_without_a_size_has_that_of_the_device(tmp_path: Path) -> None:
+    file = tmp_path / "K.txt"
+    file.write_text("50 0 31\n0 51 24\n0 0 1\n")
+    stream = RealSenseStream("simulated", SimulatedDevice, file)
+    assert stream.camera == PinholeCamera(*COLOUR_K, WIDTH, HEIGHT, depth_scale=1000)
+    assert len(take_frames(stream, 1)) == 1
 
 
 @pytest.mark.parametrize(
@@ -400,6 +411,12 @@ def test_recording_yields_all_frames_at_any_speed(recording: Path) -> None:
         runs.append(numbers)
     assert runs[0] == runs[1] == list(range(runs[0][0], runs[0][-1] + 1))
     assert len(runs[0]) >= 10
+
+
+def test_recording_with_a_suffix_in_upper_case_is_an_input_error(recording: Path, tmp_path: Path) -> None:
+    path = shutil.copyfile(recording, tmp_path / "TAKE.DB3")
+    with pytest.raises(InputError, match=r"TAKE\.DB3: librealsense needs .*; rename the file to TAKE\.db3$"):
+        open_source(path)
 
 
 def test_recording_is_a_stream_not_a_sequence(recording: Path) -> None:

@@ -78,6 +78,17 @@ def test_only_optical_frames_of_one_camera_are_aligned(camera: str, imu: str, is
     assert (gravity is not None) == is_used
 
 
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_transform_without_a_valid_rotation_is_skipped(value: float, tmp_path: Path) -> None:
+    make, tilt = MessageFactory("mcap"), Rotation.from_euler("x", 0.5)
+    invalid, valid = (make.transform("optical", "imu", tilt) for _ in range(2))
+    invalid.transforms[0].transform.rotation = make.store.types["geometry_msgs/msg/Quaternion"](*[value] * 4)
+    transforms = [("/tf_static", 1.0, message) for message in (invalid, valid)]
+    measured = measurements(make, tilt.inv().apply(-9.81 * DOWN), "imu")
+    gravity = write_bag(make, tmp_path, [*transforms, *measured])[0].gravity
+    assert gravity is not None and float(gravity @ torch.from_numpy(DOWN)) > np.cos(np.radians(0.5))
+
+
 def test_accelerometer_of_the_same_camera_is_preferred(tmp_path: Path) -> None:
     """Both could be used: the names of the frames do not tell the cameras apart."""
     make = MessageFactory("mcap")

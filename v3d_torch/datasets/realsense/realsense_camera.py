@@ -72,7 +72,7 @@ class RealSenseCamera(RealSenseStream):
                         shift = _clock_shift(stamp, stamp + now - arrival, captured.stamp)
                     stamp, arrival = captured.stamp + shift, now
                     self._captured_at = _capture_time(self.name, captured.stamp, captured.colour, now)
-                    frame = self._convert_frame(index, stamp, captured, device)
+                    frame = self._convert_frame(index, stamp, captured)
                     yield frame if index else replace(frame, gravity=gravity)
                     index += 1
             device = self._reopen(first.serial)

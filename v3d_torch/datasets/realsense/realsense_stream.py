@@ -76,10 +76,9 @@ class RealSenseStream:
         Raises:
             InputError: If the camera stops sending frames or sends an unsupported format.
         """
-        device = self._open_device()
-        with closing(self._images(device)) as images:
+        with closing(self._images(self._open_device())) as images:
             for index, captured in enumerate(images):
-                yield self._convert_frame(index, captured.stamp, captured, device)
+                yield self._convert_frame(index, captured.stamp, captured)
 
     def _images(self, device: Device) -> Generator[CapturedImages, None, None]:
         """Start the device and yield the images of each frame; stop the device at the end."""
@@ -126,7 +125,7 @@ class RealSenseStream:
         """Check whether another thread ended the iteration."""
         return False
 
-    def _convert_frame(self, index: int, stamp: float, captured: CapturedImages, device: Device) -> RGBDFrame:
+    def _convert_frame(self, index: int, stamp: float, captured: CapturedImages) -> RGBDFrame:
         colour, depth = captured.colour, captured.depth
         encoding = colour.get_profile().format().name
         if encoding not in COLOUR_ENCODINGS:
@@ -140,7 +139,7 @@ class RealSenseStream:
         # librealsense reuses the memory of both images: convert_to_rgb and depth_to_metres copy it.
         pixels = np.asanyarray(colour.get_data()).view(np.uint8).reshape(height, width, COLOUR_ENCODINGS[encoding][0])
         units = np.asanyarray(depth.get_data())
-        metres = self.camera.correct_depth(depth_to_metres(units, depth_scale_from(device.depth_unit)))
+        metres = self.camera.correct_depth(depth_to_metres(units, self.camera.depth_scale))
         image = convert_to_rgb(encoding, pixels)
         return RGBDFrame(index, stamp, image, metres, depth_delay=captured.depth_delay, camera=self.camera)
 
@@ -151,12 +150,18 @@ def _choose_camera(name: str, device: Device, camera: CameraChoice) -> PinholeCa
         calibrated = camera_from_intrinsics(name, device.intrinsics, device.depth_unit)
         check_distortion(calibrated, name)
         return calibrated
-    given = load_given_camera(camera)
+    given = load_given_camera(camera, lambda: (device.intrinsics.width, device.intrinsics.height))
     return given if given.depth_scale is not None else replace(given, depth_scale=depth_scale_from(device.depth_unit))
 
 
 def open_realsense_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:
-    """Open a file that RealSense software recorded as a stream, see `open_recorded_device`."""
+    """Open a file that RealSense software recorded as a stream.
+
+    Raises:
+        InputError: If the file cannot be opened, see `open_recorded_device`.
+    """
+    if path.suffix.lower() == ".db3" != path.suffix:  # read as the older format by librealsense
+        raise InputError(f"{path}: librealsense needs the suffix in lower case; rename the file to {path.stem}.db3")
     return RealSenseStream(path.resolve().stem, partial(open_recorded_device, path), camera)
 
 
@@ -165,5 +170,5 @@ def is_realsense_recording(path: Path) -> bool:
 
     Such a bag needs librealsense: its depth is not aligned to colour, and it has no CameraInfo of ROS.
     """
-    is_bag_file = path.suffix in (".bag", ".db3") and path.is_file()
+    is_bag_file = path.suffix.lower() in (".bag", ".db3") and path.is_file()
     return is_bag_file and any(topic.startswith("/device_0/") for topic in read_topic_types(path))

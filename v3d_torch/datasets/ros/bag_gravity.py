@@ -101,7 +101,10 @@ def _find_rotation(target: str, source: str, messages: list[Any]) -> NDArray[np.
     for transform in (transform for message in messages for transform in message.transforms):
         parent, child = transform.header.frame_id.strip("/"), transform.child_frame_id.strip("/")
         q = transform.transform.rotation
-        rotation = Rotation.from_quat([q.x, q.y, q.z, q.w])  # child to parent
+        quaternion = np.array([q.x, q.y, q.z, q.w])
+        if not 0 < np.linalg.norm(quaternion) < np.inf:
+            continue  # a publisher without a calibration leaves the rotation unset
+        rotation = Rotation.from_quat(quaternion)  # child to parent
         neighbours.setdefault(child, []).append((parent, rotation))
         neighbours.setdefault(parent, []).append((child, rotation.inv()))
     known, pending = {source: Rotation.identity()}, [source]
