@@ -31,6 +31,7 @@ def test_presets_have_published_parameters() -> None:
             "camera.yaml",
             "fx: 1\nfy: 2\ncx: 3\ncy: 4\nwidth: 5\nheight: 6\ndepth_scale: 7\ndistortion: [1, 2, 3, 4, 5]\n",
         ),
+        ("CAMERA.YAML", "fx: 1\nfy: 2\ncx: 3\ncy: 4\nwidth: 5\nheight: 6\ndepth_scale: 7\n"),
         ("K.txt", "# fx fy cx cy depth_scale w h\n1 2 3 4 7 5 6\n"),
         ("K.txt", "\ufeff1 2 3 4\r\n7 5, 6\r\n"),
         ("K.txt", "1 0 3\n0 2 4\n0 0 1\n"),

@@ -10,6 +10,7 @@ from functools import partial
 import pytest
 
 from v3d_torch.datasets.stored import Cursor
+from v3d_torch.errors import InputError
 
 
 def test_cursor_restarts_the_stream_only_to_go_back() -> None:
@@ -26,6 +27,22 @@ def test_cursor_restarts_the_stream_only_to_go_back() -> None:
     with pytest.raises(IndexError):
         cursor[5]
     assert cursor[2] == "c"
+
+
+def test_stream_is_opened_again_after_it_raised() -> None:
+    errors = [InputError("is damaged")]
+
+    def start() -> Iterator[str]:
+        yield "a"
+        if errors:
+            raise errors.pop()
+        yield "b"
+
+    cursor = Cursor(start)
+    assert cursor[0] == "a"
+    with pytest.raises(InputError, match="is damaged"):
+        cursor[1]
+    assert cursor[1] == "b"
 
 
 def test_pickled_cursor_starts_again() -> None:

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from PIL import Image
 
 from v3d_torch.datasets import SourceOptions, load_sequence
 from v3d_torch.datasets.depth_files import is_depth_file, read_depth_file
+from v3d_torch.datasets.images import image_size
 from v3d_torch.errors import InputError
 
 METRES = np.random.default_rng(0).uniform(0.5, 4.0, (HEIGHT, WIDTH)).astype(np.float32)
@@ -164,6 +166,19 @@ def test_tiff_of_another_kind_is_rejected(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tiff", METRES.astype(np.float64))
     with pytest.raises(InputError, match=r"a.tiff: is a TIFF image of an unsupported kind; export depth as 16-bit PNG"):
         read_depth_file(tmp_path / "a.tiff")
+
+
+def test_only_the_first_bytes_of_a_tiff_of_another_kind_are_read_for_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "read_bytes", Mock(side_effect=MemoryError))
+    for name, content, cause in (
+        ("a.tiff", b"MM\0*", "is a TIFF image of an unsupported kind"),
+        ("a.png", b"MM\0", "is not a PNG, JPEG or TIFF image"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=cause):
+            image_size(tmp_path / name)
 
 
 def test_depth_in_millimetres_in_floating_point_is_rejected(tmp_path: Path) -> None:

@@ -105,6 +105,11 @@ def test_colour_and_depth_in_one_folder_are_paired_by_name(root: Path) -> None:
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 0), (1, 1)])
 
 
+def test_image_with_words_for_both_kinds_in_its_name_is_depth(root: Path) -> None:
+    fill(root, ["image_0.png", "image_1.png"], ["depth_image_0.png", "depth_image_1.png"])
+    assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 0), (1, 1)])
+
+
 def test_kind_at_the_start_of_names_is_ignored_in_pairing(root: Path) -> None:
     fill(root, ["color_000001.png", "color_000002.png"], ["depth_000002.png", "depth_000001.png"])
     assert_frames(load_sequence(str(root), options=FPS), [0, 0.1], [(0, 1), (1, 0)])

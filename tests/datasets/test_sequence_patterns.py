@@ -66,6 +66,13 @@ def test_folder_that_cannot_be_read_matches_no_pattern(root: Path, monkeypatch: 
         open_source(root / "lost+found")
 
 
+def test_damaged_bag_is_matched_and_reported_when_it_is_opened(root: Path) -> None:
+    (root / "walk_c.bag").write_bytes(b"#ROSBAG V2.0\n")
+    assert find(["walk_*"], root) == ["walk_a", "walk_b", "walk_c.bag"]
+    with pytest.raises(InputError, match=r"walk_c\.bag: is damaged or not a bag"):
+        open_source(root / "walk_c.bag")
+
+
 def test_pattern_matches_paths(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert find([str(root / "walk*")]) == [str(root / "walk_a"), str(root / "walk_b")]
     monkeypatch.chdir(root.parent)

@@ -49,6 +49,10 @@ def test_frames_can_be_read_in_any_order(folder: Path, given: str, capfd: pytest
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="threads are counted in /proc")
+def test_dot_in_the_name_of_a_folder_is_no_suffix(folder: Path) -> None:
+    assert load_sequence(str(folder.rename(folder.with_name("run_v1.2")))).name == "run_v1.2"
+
+
 def test_reading_starts_no_threads_that_would_block_a_forked_process(tmp_path: Path) -> None:
     write_video(tmp_path / "large.avi", 30, [np.zeros((480, 640, 3), np.uint8)])
     before = len(list(Path("/proc/self/task").iterdir()))

@@ -12,7 +12,7 @@ from helpers.trajectories import assert_statistics, noisy, random_walk
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from v3d_torch.errors import InputError
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource
 from v3d_torch.evaluation.evaluation import absent_scores, format_coverage, note_too_few_poses
@@ -126,6 +126,14 @@ def test_fewer_than_three_associated_poses_are_rejected() -> None:
     for estimate in (elsewhere, empty, Trajectory(groundtruth.stamps[:2], groundtruth.T_wc[:2])):
         with pytest.raises(InputError, match="at least 3 are needed; check that both belong to the same sequence"):
             evaluate(groundtruth, estimate)
+
+
+@pytest.mark.parametrize("difference", [-1.0, float("nan")])
+def test_time_difference_that_is_not_at_least_zero_is_rejected(difference: float) -> None:
+    groundtruth = random_walk(10, seed=3)
+    with pytest.raises(ConfigError, match=f"^max_time_difference is {difference}; give a time of at least 0 seconds$"):
+        evaluate(groundtruth, groundtruth, max_time_difference=difference)
+    assert evaluate(groundtruth, groundtruth, max_time_difference=0).pairs == 10
 
 
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])

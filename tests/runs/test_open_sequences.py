@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import replace
 from io import StringIO
 from pathlib import Path
@@ -65,6 +66,19 @@ def test_two_sequences_with_the_same_name_are_rejected(tmp_path: Path) -> None:
         write_base(folder)
     with pytest.raises(InputError, match=re.escape(f"{second}: {first} has the same name, seq; run them separately")):
         open_sequences([str(first), str(second)], None, Console())
+
+
+def test_two_sequences_with_the_same_folder_of_results_are_rejected(tmp_path: Path) -> None:
+    scenes, other = tmp_path / "chess" / "seq-01", tmp_path / "chess_seq-01"
+    write_base(other)
+    scenes.mkdir(parents=True)
+    (scenes / "camera.yaml").write_text((other / "camera.yaml").read_text())
+    for kind, name in (("rgb", "color"), ("depth", "depth")):
+        for index, image in enumerate(sorted((other / kind).iterdir())):
+            shutil.copyfile(image, scenes / f"frame-{index:06d}.{name}.png")
+    assert [*open_sequences([str(scenes)], None, Console())] == ["chess/seq-01"]
+    with pytest.raises(InputError, match=re.escape(f"{other}: {scenes} has the same name, chess_seq-01; run them")):
+        open_sequences([str(scenes), str(other)], None, Console())
 
 
 def test_all_sequences_that_are_not_valid_are_named(tmp_path: Path) -> None:

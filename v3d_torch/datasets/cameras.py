@@ -61,7 +61,7 @@ def load_camera(path_or_name: str | Path, image_size: ImageSize | None = None) -
         hint = f"did you mean {similar[0]}?" if similar else f"the presets are {', '.join(PRESETS)}"
         raise InputError(f"{path_or_name}: is not a camera file or preset; {hint}")
     text = read_text(path, "a camera is a YAML file or a K.txt")
-    parse = _from_yaml if path.suffix in (".yaml", ".yml") else _from_numbers
+    parse = _from_yaml if path.suffix.lower() in (".yaml", ".yml") else _from_numbers
     return parse(text, str(path), image_size)
 
 

@@ -91,7 +91,7 @@ def _images_side_by_side(folder: Path) -> tuple[list[Path], list[Path]]:
     """Colour and depth images in the folder itself, by their names."""
     images = list_images(folder)
     depth = [path for path in images if _DEPTH.search(path.stem)]
-    return [path for path in images if path not in depth and _COLOUR.search(path.stem)], depth
+    return [path for path in images if _COLOUR.search(path.stem) and not _DEPTH.search(path.stem)], depth
 
 
 def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Path, Path]]:

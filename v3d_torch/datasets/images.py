@@ -30,6 +30,9 @@ _MAX_BYTES = 8 * MAX_PIXELS
 _JPEG_SIGNATURE = b"\xff\xd8\xff"
 """First bytes of a JPEG image."""
 
+_TIFF_SIGNATURES = (b"II*\0", b"MM\0*")
+"""First bytes of a TIFF image, for both byte orders."""
+
 
 def read_colour(path: Path) -> Tensor:
     """Read a colour image from a file, see `decode_colour`.
@@ -65,7 +68,7 @@ def decode_colour(content: bytes, source: object) -> Tensor:
     """
     pixels = _decode_common(content)
     if pixels is None or pixels.shape[2] != 3:
-        pixels = _decode_colour_with_pillow(BytesIO(content), source)
+        pixels = _decode_colour_with_pillow(content, source)
     return torch.from_numpy(pixels).permute(2, 0, 1)
 
 
@@ -136,8 +139,8 @@ def _is_depth_mode(mode: str) -> bool:
     return mode.startswith("I") or mode == "F"
 
 
-def _decode_colour_with_pillow(file: Path | BytesIO, source: object) -> NDArray[np.uint8]:
-    with _decode(file, source) as image:
+def _decode_colour_with_pillow(content: bytes, source: object) -> NDArray[np.uint8]:
+    with _decode(content, source) as image:
         if _is_depth_mode(image.mode):
             kind = "floating-point" if image.mode == "F" else "16-bit"
             raise InputError(
@@ -148,7 +151,7 @@ def _decode_colour_with_pillow(file: Path | BytesIO, source: object) -> NDArray[
 
 
 def _decode_other_depth(content: bytes, source: object) -> NDArray[np.generic]:
-    with _decode(BytesIO(content), source) as image:
+    with _decode(content, source) as image:
         if image.format == "PPM" and image.mode == "I":
             return _decode_pgm(content, source)
         if _is_depth_mode(image.mode):
@@ -169,15 +172,13 @@ def _decode_pgm(content: bytes, source: object) -> NDArray[np.generic]:
     return pixels
 
 
-def _decode(file: Path | BytesIO, source: object) -> Image.Image:
+def _decode(content: bytes, source: object) -> Image.Image:
     """Decode a whole image."""
-    image = _read_header(file, source)
+    image = _read_header(BytesIO(content), source)
     try:
         if image.format == "PNG":  # Pillow ignores the checksum of pixel data unless verify() is called
             image.verify()
-            if isinstance(file, BytesIO):
-                file.seek(0)
-            image = _read_header(file, source)
+            image = _read_header(BytesIO(content), source)
         image.load()
     except Exception as error:  # on invalid data a decoder can raise any exception
         image.close()
@@ -225,8 +226,10 @@ def _file_errors(source: object) -> Iterator[None]:
 
 def _is_tiff(file: Path | BytesIO) -> bool:
     """Check the first bytes of a file."""
-    content = file.getvalue() if isinstance(file, BytesIO) else file.read_bytes()
-    return content.startswith((b"II*\0", b"MM\0*"))
+    if isinstance(file, BytesIO):
+        return file.getvalue().startswith(_TIFF_SIGNATURES)
+    with file.open("rb") as opened:
+        return opened.read(len(_TIFF_SIGNATURES[0])) in _TIFF_SIGNATURES
 
 
 def too_large_error(source: object) -> InputError:

@@ -108,10 +108,13 @@ _UNKNOWN = (
 def is_source(path: Path) -> bool:
     """Check whether a path is a source of any supported kind. Opening the source checks its content.
 
-    A path that cannot be read is none: many file systems have such a folder, for example ``lost+found``.
+    A path that cannot be read is none: many file systems have such a folder, for example ``lost+found``. A damaged bag
+    is one, so that it is not left out of a pattern without an error.
     """
     try:
         return any(source.matches(path) for source in SOURCES)
+    except InputError:  # raised again when the path is opened
+        return True
     except OSError:
         return False
 

@@ -126,8 +126,8 @@ class StoredSequence(ABC):
 class Cursor(Generic[_T]):
     """Random access to the items of a stream that can only be read forward.
 
-    Reading forward continues the stream; reading backward restarts it, and so does another process, to which a cursor
-    was copied or pickled.
+    Reading forward continues the stream; reading backward restarts it, and so do reading after an error, and another
+    process, to which a cursor was copied or pickled.
 
     Args:
         start: Function that returns an iterator over all items.
@@ -155,12 +155,12 @@ class Cursor(Generic[_T]):
             return self._item
         if self._index is None or index < self._index:
             self._items, self._index = self._start(), -1
-        self._item = next(islice(self._items, index - self._index - 1, None), None)
-        self._index = index
-        if self._item is None:
-            self._index = None
+        following = islice(self._items, index - self._index - 1, None)
+        self._index = self._item = None  # a stream that raises or ends cannot be continued
+        if (item := next(following, None)) is None:
             raise IndexError(index)
-        return self._item
+        self._index, self._item = index, item
+        return item
 
     def __reduce__(self) -> tuple[type[Cursor[_T]], tuple[Callable[[], Iterator[_T]]]]:
         """Pickle the start of the stream alone."""

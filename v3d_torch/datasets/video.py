@@ -22,6 +22,7 @@ from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
 from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
+from v3d_torch.io.paths import path_label
 from v3d_torch.io.timestamps import associate
 from v3d_torch.types import RGBDFrame
 
@@ -76,7 +77,7 @@ class VideoSequence(ImageSequence):
                 " that both videos belong to the same recording"
             )
         super().__init__(
-            path.resolve().stem,
+            path_label(path),
             [stamps[i] for i, _ in self._pairs],
             chosen,
             delays=[depth_stamps[j] - stamps[i] for i, j in self._pairs],

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from v3d_torch.errors import InputError
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
 from v3d_torch.evaluation.ate import Alignment, RotationSource, absolute_errors, align, scale_error
 from v3d_torch.evaluation.rpe import RPE, relative_pose_error
@@ -85,7 +85,7 @@ def evaluate(
     Args:
         groundtruth: Ground-truth poses.
         estimate: Estimated poses, in any world.
-        max_time_difference: Maximum difference between the timestamps of a pair, seconds.
+        max_time_difference: Maximum difference between the timestamps of a pair, seconds, at least 0.
         rpe_delta: Time over which the RPE measures drift, seconds.
         frames: Number of colour-depth pairs of the sequence, for the coverage.
         is_located: True for each pose of the estimate that was measured relative to the map, bool, shape :math:`(N,)`;
@@ -94,7 +94,7 @@ def evaluate(
     Raises:
         InputError: If fewer than three poses can be associated, if an argument is not a trajectory, if an associated
             pose is not finite, or if ``is_located`` is not a mask of the poses.
-        ConfigError: If ``rpe_delta`` is not positive.
+        ConfigError: If ``max_time_difference`` is negative or not a number, or ``rpe_delta`` is not positive.
     """
     for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
         if not isinstance(value, Trajectory):
@@ -105,6 +105,8 @@ def evaluate(
     check_masks(is_located=is_located)
     if is_located is not None and len(is_located) != len(estimate):
         raise InputError(f"is_located has {len(is_located)} values for {len(estimate)} poses; give one for each pose")
+    if not max_time_difference >= 0:  # also for NaN
+        raise ConfigError(f"max_time_difference is {max_time_difference}; give a time of at least 0 seconds")
     matches = associate_trajectories(groundtruth, estimate, max_time_difference)
     if len(matches) < MIN_PAIRS:
         raise InputError(

@@ -11,6 +11,7 @@ from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
 from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
+from v3d_torch.io.paths import folder_name
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 
@@ -70,7 +71,7 @@ def open_sequences(
         Sequences by their name in tables.
 
     Raises:
-        InputError: If sequences are not valid, or two sequences have the same name.
+        InputError: If sequences are not valid, or two sequences have the same name, also as folders of results.
         DownloadError: If a sequence is missing and cannot be downloaded.
     """
     sequences: dict[str, RGBDSequence] = {}
@@ -82,8 +83,9 @@ def open_sequences(
             sequence = _load(name, data_root, console, skip_broken=skip_broken)
             check_groundtruth(sequence)  # runs are compared by their scores
             print_notes(sequence, console)
-            if (other := sources.setdefault(sequence.name, name)) != name:
-                raise InputError(f"{name}: {other} has the same name, {sequence.name}; run them separately")
+            folder = folder_name(sequence.name)  # of the results, such as a_b for the sequence a/b
+            if (other := sources.setdefault(folder, name)) != name:
+                raise InputError(f"{name}: {other} has the same name, {folder}; run them separately")
             sequences[sequence.name] = sequence
         except InputError as error:
             errors.append(error)
