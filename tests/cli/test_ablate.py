@@ -24,7 +24,7 @@ from v3d_torch.errors import InputError, OutputError
 from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import RunRequest, read_request
 from v3d_torch.runs.result_folder import lock_results
 from v3d_torch.types import RGBDFrame, Trajectory
 from v3d_torch.viz.trajectory_figure import save_trajectory_figure
@@ -93,6 +93,10 @@ def test_every_run_writes_results_and_configuration_of_its_variant(done: tuple[P
         for name in ("trajectory.txt", "metrics.json", "dynamics.parquet", "run.log", "figures/trajectory.png"):
             assert (folder / name).is_file()
         assert load_config(folder / "config.yaml") == load_config(CONFIGS[variant])
+
+
+def test_sequence_of_a_run_is_found_again(done: tuple[Path, str], sequence: Path) -> None:
+    assert read_request(done[0] / "moment" / "baseline" / "seed0").seq == str(sequence)
 
 
 def test_folder_to_which_another_study_writes_is_error(sequence: Path, tmp_path: Path) -> None:

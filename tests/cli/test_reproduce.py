@@ -259,3 +259,13 @@ def test_damaged_sequence_is_an_error(server: str, fake_runs: list[str], tmp_pat
     folder.mkdir(parents=True)
     assert_error_line(call("--data-root", tmp_path / "data", "--out", tmp_path / "out"), folder)
     assert not fake_runs
+
+
+def test_damaged_ground_truth_is_an_error(server: str, fake_runs: list[str], tmp_path: Path) -> None:
+    assert call("--data-root", tmp_path / "data", "--out", tmp_path / "first", "--seeds", "1").exit_code == 0
+    fake_runs.clear()
+    truth = tmp_path / "data" / SERVED[0] / "groundtruth.txt"
+    truth.write_text("1 2 3\n")
+    done = call("--data-root", tmp_path / "data", "--out", tmp_path / "second")
+    assert_error_line(done, f"{truth}: line 1 is '1 2 3'")
+    assert not fake_runs

@@ -100,9 +100,11 @@ def run_ablation_study(
         for variant, config in variant_configs.items()
         for seed in range(seeds)
     }
-    sequences = open_sequences(names, data_root, console)
+    sources = list(dict.fromkeys(names))
+    opened = open_sequences(sources, data_root, console)
+    sequences = {name: (source, opened[name]) for source, name in zip(sources, opened, strict=True)}
     network = cache(make_instance_source)
-    camera = next(iter(sequences.values())).camera
+    camera = next(iter(opened.values())).camera
     for config in configs.values():  # a missing segmenter is an error before the first run
         if config.stages.segment is None:
             network(_network_config(config))
@@ -110,7 +112,7 @@ def run_ablation_study(
             make_segmenter(config, camera)
     folder = make_result_folder(out, "ablation")
     with lock_results(folder):
-        outcomes = _run_variants(folder, sequences, configs, network, console)
+        outcomes = _run_variants(folder, sequences, configs, network, data_root, console)
     console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
     print_line(console, f"results: {folder}")
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
@@ -119,26 +121,37 @@ def run_ablation_study(
 
 def _run_variants(
     folder: Path,
-    sequences: Mapping[str, RGBDSequence],
+    sequences: Mapping[str, tuple[str, RGBDSequence]],
     configs: Mapping[tuple[str, int], Config],
     network: Callable[[SegmentationConfig], Segmenter],
+    data_root: Path | None,
     console: Console,
 ) -> list[Outcome]:
-    """Run each configuration, given by variant and seed, on each sequence; write the tables after each run."""
+    """Run each configuration, given by variant and seed, on each sequence; write the tables after each run.
+
+    Args:
+        folder: Folder of the study.
+        sequences: Source (path or name) and opened sequence, by the name in tables.
+        configs: Configurations by variant and seed.
+        network: Function that returns the network of a configuration.
+        data_root: Folder of named sequences, with which another command finds them again; None for ``$V3D_DATA``.
+        console: Console for progress and tables.
+    """
     if (folder / _TABLE).exists():
         raise InputError(f"{folder}: contains an earlier study; choose another folder with --out")
     outcomes: list[Outcome] = []
     try:
-        for name, sequence in sequences.items():
-            sources: dict[SegmentationConfig, Segmenter] = {}
+        for name, (source, sequence) in sequences.items():
+            cached: dict[SegmentationConfig, Segmenter] = {}
             for (variant, seed), config in configs.items():
                 if config.stages.segment is None:
                     key = _network_config(config)
-                    segment = wrap_upright(sources.setdefault(key, CachedSegmenter(network(key))), config.segmentation)
+                    segment = wrap_upright(cached.setdefault(key, CachedSegmenter(network(key))), config.segmentation)
                 else:
                     segment = make_segmenter(config, sequence.camera)
                 run_folder = make_result_folder(folder / folder_name(name) / variant / f"seed{seed}", name)
-                metrics, failure = _run(sequence, segment, config, run_folder, console)
+                request = RunRequest(source, config, data_root=None if data_root is None else str(data_root))
+                metrics, failure = _run(request, sequence, segment, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 print_line(console, str(outcomes[-1]))
                 write_text(folder / "ablation.md", format_markdown(outcomes, _NOTE))
@@ -162,7 +175,7 @@ def _network_config(config: Config) -> SegmentationConfig:
 
 
 def _run(
-    sequence: RGBDSequence, segment: Segmenter, config: Config, folder: Path, console: Console
+    request: RunRequest, sequence: RGBDSequence, segment: Segmenter, folder: Path, console: Console
 ) -> tuple[dict[str, object], str | None]:
     """Run a sequence and write the results.
 
@@ -175,7 +188,6 @@ def _run(
         OutputError: If the results cannot be written.
     """
     try:
-        request = RunRequest(sequence.name, config)
         pipeline, _ = run_with_progress(
             lambda: Run(request, sequence, segment, folder, save_checkpoints=False), sequence, folder, console
         )

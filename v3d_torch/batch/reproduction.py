@@ -36,7 +36,7 @@ from v3d_torch.evaluation.tables import (
     make_screen_table,
 )
 from v3d_torch.io.files import write_text
-from v3d_torch.runs.open_sequences import open_sequence
+from v3d_torch.runs.open_sequences import check_groundtruth, open_sequence
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.result_folder import lock_results, make_result_folder
 
@@ -178,7 +178,7 @@ def _open_paper_sequences(
         download failed.
 
     Raises:
-        InputError: If a sequence is damaged.
+        InputError: If a sequence or its ground truth is damaged.
     """
     opened: dict[str, RGBDSequence] = {}
     missing: list[str] = []
@@ -189,8 +189,11 @@ def _open_paper_sequences(
             missing.append(full_name)
             continue
         try:
-            opened[name] = open_sequence(name, data_root, console)
+            sequence = open_sequence(name, data_root, console)
         except DownloadError as error:
             missing.append(full_name)
             reason = reason or str(error.__cause__ or error)
+        else:
+            check_groundtruth(sequence)  # the tables contain scores
+            opened[name] = sequence
     return opened, missing, reason

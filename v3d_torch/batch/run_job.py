@@ -51,7 +51,7 @@ def _run(job: Job, on_frame: FrameCallback) -> str | None:
         clear_earlier_results(job.folder)
     with log_to(job.folder / RunFile.LOG, append=checkpoint is not None):
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", GroundTruthWarning)  # reported as the failure of the run
+            warnings.simplefilter("ignore", GroundTruthWarning)  # in the diagnosis of the run
             warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run
             sequence = load_sequence(job.source, data_root=job.data_root, skip_broken=job.skip_broken)
         if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
