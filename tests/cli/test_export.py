@@ -214,6 +214,12 @@ def test_missing_file_is_an_error_and_nothing_is_written(file: str, words: str, 
     assert not (tmp_path / "out").exists()
 
 
+def test_folder_in_a_suggested_command_is_quoted(results: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(results, tmp_path / "my run")
+    (copy / "map.ply").unlink()
+    assert_error_line(call(copy, "--format", "nerfstudio", "--out", tmp_path / "out"), f"run --resume '{copy}'")
+
+
 def test_unsuitable_options_and_folders_are_errors(results: Path, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "diary.txt").write_text("")

@@ -355,6 +355,25 @@ def test_8_bit_depth_is_rejected(copy: Path, tmp_path: Path) -> None:
     assert_error_line(done, str(path), "8-bit", "16 bits")
 
 
+@pytest.mark.parametrize(
+    ("file", "words"),
+    [
+        ("masks/1.0.png", "would be written while it is read"),
+        ("map.ply", "exists and was not written by a run"),
+        (".", "cannot be made"),
+    ],
+)
+def test_unsuitable_result_folder_leaves_no_recording(file: str, words: str, sequence: Path, tmp_path: Path) -> None:
+    """The same command with another folder would be refused because of the recording."""
+    path = tmp_path / "out" / file
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("")
+    masks = ("--segmenter", "masks", "--masks", "out/masks") if "masks" in file else ("--segmenter", "none")
+    done = call_here("--seq", sequence, *masks, "--out", "out", "--rerun", "run.rrd", cwd=tmp_path)
+    assert_error_line(done, words)
+    assert not (tmp_path / "run.rrd").exists()
+
+
 @pytest.mark.parametrize("below", [False, True])
 def test_result_folder_at_or_below_a_file_is_rejected(below: bool, sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")

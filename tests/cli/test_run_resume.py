@@ -215,6 +215,14 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
     assert_same_results(out, whole_run)
 
 
+def test_folder_in_the_way_to_resume_is_quoted(tmp_path: Path) -> None:
+    folder = tmp_path / "my run"
+    folder.mkdir()
+    assert run_command._way_to_resume(folder) == ""
+    (folder / RunFile.CHECKPOINT).touch()
+    assert run_command._way_to_resume(folder) == f"; resume with --resume '{folder}'"
+
+
 def test_message_of_ctrl_c_while_results_are_written_names_the_way_to_resume(
     sequence: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,9 +1,10 @@
-"""Table and file of a calibrated camera."""
+"""Runs of a calibration, and table and file of a calibrated camera."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from io import StringIO
+from unittest.mock import MagicMock, Mock
 
 import pytest
 from helpers.rooms import CAMERA
@@ -11,7 +12,15 @@ from rich.console import Console
 
 from v3d_torch.calibration.camera_calibration import Calibration
 from v3d_torch.calibration.selection import Estimate
-from v3d_torch.runs.calibration_run import UNITS, _is_converged, calibration_table, calibration_text
+from v3d_torch.config import Config
+from v3d_torch.runs import calibration_run
+from v3d_torch.runs.calibration_run import (
+    UNITS,
+    _is_converged,
+    calibrate_sequence,
+    calibration_table,
+    calibration_text,
+)
 
 
 def calibrated(*estimates: Estimate) -> Calibration:
@@ -61,6 +70,17 @@ def test_runs_are_converged_if_no_estimate_changes_by_more_than_half_its_deviati
     )
     assert _is_converged(after, CAMERA, before) is converged
     assert not _is_converged(after, CAMERA, None) and not _is_converged(calibrated(), CAMERA, before)
+
+
+def test_sequence_is_opened_again_for_each_run_but_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No run converges."""
+    pipeline = Mock(return_value=Mock(failure=None))
+    stubs = {"Pipeline": Mock(return_value=pipeline), "make_system": Mock(), "calibrate_camera": Mock()}
+    for name, stub in {**stubs, "_is_converged": Mock(return_value=False)}.items():
+        monkeypatch.setattr(calibration_run, name, stub)
+    reopen, on_run = MagicMock(), Mock()
+    calibrate_sequence(MagicMock(), reopen, Mock(), Config(), on_run)
+    assert on_run.call_count == 4 and reopen.call_count == 3
 
 
 def test_runs_are_not_converged_if_other_focal_lengths_explain_the_images_better() -> None:

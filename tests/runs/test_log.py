@@ -25,6 +25,15 @@ def test_message_is_one_line_without_control_characters(tmp_path: Path) -> None:
     assert "Traceback (most recent call last):\n" in text and "\x1b" not in text
 
 
+def test_logger_of_the_package_is_as_before_after_a_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    package = logging.getLogger("v3d_torch")
+    caplog.set_level(logging.ERROR, package.name)
+    with pytest.raises(ValueError, match="broken"), log_to(tmp_path / "run.log"):
+        assert (package.level, package.propagate) == (logging.INFO, False)
+        raise ValueError("broken")
+    assert (package.level, package.propagate) == (logging.ERROR, True)
+
+
 @pytest.mark.skipif(os.name == "nt", reason="Windows does not remove open files")
 def test_removed_log_begins_again_when_there_is_a_folder(tmp_path: Path) -> None:
     path = tmp_path / "out" / "run.log"

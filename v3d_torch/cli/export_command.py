@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -147,7 +148,10 @@ _WRITERS = {"nerfstudio": _write_nerfstudio, "colmap": _write_colmap, "tum": _wr
 def _point_map(run: StoredRun) -> Path:
     path = run.folder / RunFile.MAP
     if not path.is_file():
-        raise InputError(f"{path}: is missing, because the run did not end; continue it with run --resume {run.folder}")
+        raise InputError(
+            f"{path}: is missing, because the run did not end; continue it with run --resume"
+            f" {shlex.quote(str(run.folder))}"
+        )
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field, replace
@@ -32,7 +33,7 @@ from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
-from v3d_torch.runs.result_folder import check_unlocked, make_result_folder
+from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
@@ -189,10 +190,11 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
     if isinstance(segment, MaskFolder) and isinstance(sequence, Sized) and checkpoint is None:
         segment.check_number(len(sequence))
-    viewer = display.make_viewer(sequence)
-    folder = make_result_folder(out, sequence.name)
-    if masks is not None and masks.resolve() == (folder / MASKS).resolve():
-        raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
+    if out is not None:
+        make_result_folder(out, sequence.name)
+        _check_contents(out, masks, is_resumed=checkpoint is not None)
+    viewer = display.make_viewer(sequence)  # after the checks: a recording that it creates is not replaced later
+    folder = make_result_folder(out, sequence.name)  # a viewer that cannot be made leaves no folder named by the time
     if checkpoint is not None:
         total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
         print_line(console, f"resuming after {checkpoint.frames} of {total} frames")
@@ -211,6 +213,18 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
             f"{folder}: interrupted before the results were written{_way_to_resume(folder)}"
         ) from interrupt
     _print_summary(request, display, folder, pipeline, evaluation, console)
+
+
+def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> None:
+    """Check that a run would overwrite neither the masks that it reads nor files of the user.
+
+    Raises:
+        OutputError: If it would.
+    """
+    if masks is not None and masks.resolve() == (folder / MASKS).resolve():
+        raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
+    if not is_resumed:
+        find_earlier_results(folder)
 
 
 def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
@@ -271,7 +285,7 @@ def _print_summary(
 
 def _way_to_resume(folder: Path) -> str:
     """Return the end of a message on a run that ended early: how to resume it; empty if it has no checkpoint."""
-    return f"; resume with --resume {folder}" if (folder / RunFile.CHECKPOINT).is_file() else ""
+    return f"; resume with --resume {shlex.quote(str(folder))}" if (folder / RunFile.CHECKPOINT).is_file() else ""
 
 
 def _summary_table(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import warnings
 from pathlib import Path
 
@@ -57,6 +58,7 @@ def open_source(
     Raises:
         InputError: If there is no such source or its content is invalid.
         DownloadError: If the sequence is not on disk and cannot be downloaded.
+        OutputError: If a downloaded or rendered sequence cannot be written to the disk.
 
     Warns:
         GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
@@ -91,7 +93,7 @@ def load_sequence(
     if not isinstance(source, RGBDSequence):
         raise InputError(
             f"{name}: is a stream, whose frames cannot be indexed; record it first with"
-            f" v3d-torch record --seq {name} --out FOLDER"
+            f" v3d-torch record --seq {shlex.quote(str(name))} --out FOLDER"
         )
     _warn(source)
     return source

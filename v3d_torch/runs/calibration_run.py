@@ -53,8 +53,8 @@ def calibrate_sequence(
         sequence: Sequence with the given camera.
         reopen: Function that opens the sequence with another camera.
         make_segmenter: Function that makes the segmenter of a run with this camera.
-        config: Configuration of the first run, in which ``tracking.pixel_sigma`` is at least a pixel; the later ones
-            have other seeds.
+        config: Configuration. The runs raise ``tracking.pixel_sigma`` to at least a pixel, and each later run has the
+            next seed.
         on_run: Called before each run with its number, from 1, and the number of frames; returns a function that is
             called after each frame.
 
@@ -84,7 +84,7 @@ def calibrate_sequence(
             given,
             config_of_run,
         )
-        if _is_converged(calibration, camera, previous):
+        if number == _MAX_RUNS or _is_converged(calibration, camera, previous):
             break
         previous, camera = calibration, calibration.next_camera
         sequence = reopen(camera)

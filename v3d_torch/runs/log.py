@@ -19,6 +19,8 @@ _LOG = logging.getLogger("v3d_torch")
 def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
     """Write the log of the package to a file; an exception that leaves the block is logged with its traceback.
 
+    In the block the log contains messages of level INFO, and does not reach the handlers of the root logger.
+
     Args:
         path: Log file.
         append: True to append to the file, False to start a new one.
@@ -35,6 +37,7 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another folder with --out") from error
     handler.setFormatter(_OneLine("%(asctime)s %(levelname)s %(message)s"))
+    level, propagate = _LOG.level, _LOG.propagate
     _LOG.addHandler(handler)
     _LOG.setLevel(logging.INFO)
     _LOG.propagate = False
@@ -44,6 +47,8 @@ def log_to(path: Path, *, append: bool = False) -> Iterator[None]:
         _LOG.exception("the run failed")
         raise
     finally:
+        _LOG.setLevel(level)
+        _LOG.propagate = propagate
         _LOG.removeHandler(handler)
         handler.close()
 

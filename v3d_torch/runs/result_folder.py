@@ -121,18 +121,27 @@ def lock_results(folder: Path) -> Iterator[None]:
         lock.release()
 
 
+def find_earlier_results(folder: Path) -> list[Path]:
+    """Return the files of an earlier run in a folder, without its log.
+
+    Raises:
+        OutputError: If the folder has files with the names of results but no log of a run: they can be the user's own,
+            such as a ground truth.
+    """
+    earlier = [path for pattern in (*_RESULTS, *_UNFINISHED) for path in sorted(folder.glob(pattern))]
+    if earlier and not (folder / RunFile.LOG).is_file():
+        raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
+    return earlier
+
+
 def clear_earlier_results(folder: Path) -> None:
     """Remove the results of an earlier run from a folder; other files stay.
 
     Raises:
-        OutputError: If the folder has files with the names of results but no log of a run (they can be the user's
-            own, such as a ground truth), or if it cannot be written.
+        OutputError: As `find_earlier_results` raises it, or if the folder cannot be written.
     """
     try:
-        earlier = [path for pattern in (*_RESULTS, *_UNFINISHED) for path in sorted(folder.glob(pattern))]
-        if earlier and not (folder / RunFile.LOG).is_file():
-            raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
-        for path in earlier:
+        for path in find_earlier_results(folder):
             path.unlink()
         for subfolder in _SUBFOLDERS:
             with suppress(OSError):  # missing, or with other files in it

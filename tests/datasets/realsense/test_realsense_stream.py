@@ -413,6 +413,12 @@ def test_recording_yields_all_frames_at_any_speed(recording: Path) -> None:
     assert len(runs[0]) >= 10
 
 
+def test_name_in_a_suggested_command_is_quoted(recording: Path, tmp_path: Path) -> None:
+    path = shutil.copyfile(recording, tmp_path / "take 1.db3")
+    with pytest.raises(InputError, match=f"with v3d-torch record --seq '{path}' --out FOLDER$"):
+        load_sequence(path)
+
+
 def test_recording_with_a_suffix_in_upper_case_is_an_input_error(recording: Path, tmp_path: Path) -> None:
     path = shutil.copyfile(recording, tmp_path / "TAKE.DB3")
     with pytest.raises(InputError, match=r"TAKE\.DB3: librealsense needs .*; rename the file to TAKE\.db3$"):
