@@ -172,9 +172,10 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     console = Console(soft_wrap=True)
     if request.save_map is not None:
         check_writable(Path(request.save_map))
-    if out is not None:
-        check_unlocked(out)  # before the inputs and a recording are opened
     masks = _path(request.masks)
+    if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
+        check_unlocked(out)
+        _check_contents(out, masks, is_resumed=checkpoint is not None)
     sequence = _open_sequence(request, console)
     print_notes(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
@@ -190,11 +191,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
     if isinstance(segment, MaskFolder) and isinstance(sequence, Sized) and checkpoint is None:
         segment.check_number(len(sequence))
-    if out is not None:
-        make_result_folder(out, sequence.name)
-        _check_contents(out, masks, is_resumed=checkpoint is not None)
-    viewer = display.make_viewer(sequence)  # after the checks: a recording that it creates is not replaced later
-    folder = make_result_folder(out, sequence.name)  # a viewer that cannot be made leaves no folder named by the time
+    viewer = display.make_viewer(sequence)
+    folder = make_result_folder(out, sequence.name)
     if checkpoint is not None:
         total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
         print_line(console, f"resuming after {checkpoint.frames} of {total} frames")
