@@ -199,6 +199,14 @@ def test_impossible_samples_are_one_sentence(make: object, message: str, sequenc
     assert "\n" not in str(caught.value)
 
 
+def test_ground_truth_of_another_recording_is_an_error(moment: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(moment, tmp_path / "moment")
+    (folder / "groundtruth.txt").write_text("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 1\n")
+    message = "^moment: none of its 6 frames has a true pose; check that stamps and ground truth belong to the same rec"
+    with pytest.raises(InputError, match=message):
+        v3d.FrameDataset(load_sequence(folder))
+
+
 def batches(dataset: Dataset[Sample], workers: int, start: str | None = None) -> list[Sample]:
     loader = DataLoader(
         dataset,

@@ -151,6 +151,16 @@ def test_damaged_scannet_folder_is_rejected(folder: Path, damage: Callable[[Path
     assert str(folder) in str(caught.value) and "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("kind", ["color", "depth"])
+def test_camera_is_known_although_the_first_frame_is_broken(folder: Path, kind: str) -> None:
+    next(folder.rglob("intrinsic_depth.txt")).unlink()  # so that the sizes of both images are needed
+    expected = load_sequence(str(folder)).camera
+    (folder / kind / "0.png").write_bytes(b"")
+    with pytest.raises(InputError, match=rf"{kind}/0\.png: is not a PNG, JPEG or TIFF image"):
+        load_sequence(str(folder))
+    assert load_sequence(str(folder), skip_broken=True).camera == expected
+
+
 @pytest.mark.parametrize(
     ("pose", "message"),
     [("1 2 3\n", "is not a 3x3 or 4x4 matrix"), ("1 0 0\n0 1 0\n0 0 1\n", "is not a 4x4 pose matrix")],

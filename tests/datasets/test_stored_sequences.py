@@ -117,6 +117,21 @@ def test_order_of_associations_is_recognised_if_the_first_file_is_broken(folder:
     assert np.array_equal(sequence[1].image.permute(1, 2, 0).numpy(), colour_of(1))
 
 
+def test_size_of_the_images_is_known_although_the_first_frame_is_broken(folder: Path) -> None:
+    folder = folder.rename(folder.with_name("rgbd_dataset_freiburg3_walking_xyz"))  # its unit of depth is known
+    (folder / "camera.yaml").unlink()
+    (folder / "K.txt").write_text("30 0 15.5\n0 31 11.5\n0 0 1\n")
+    (folder / "rgb" / "0.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"rgb/0\.png: is not a PNG, JPEG or TIFF image"):
+        load_sequence(str(folder))
+    camera = load_sequence(str(folder), skip_broken=True).camera
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+    for i in (1, 2):
+        (folder / "rgb" / f"{i}.png").write_bytes(b"")
+    with pytest.raises(InputError, match=r"rgb/0\.png: is not a PNG, JPEG or TIFF image"):
+        load_sequence(str(folder), skip_broken=True)
+
+
 def test_duplicate_and_unsorted_stamps_are_sorted_once(folder: Path) -> None:
     (folder / "rgb.txt").write_text("12 rgb/2.png\n10 rgb/0.png\n10 rgb/1.png\n")
     sequence = load_sequence(str(folder))

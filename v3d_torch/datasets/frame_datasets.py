@@ -49,7 +49,8 @@ class SequenceDataset(Dataset[Sample], ABC):
         transform: The function that is applied to each sample.
 
     Raises:
-        InputError: If the sequence has no stored frames, or has no frames for a sample.
+        InputError: If the sequence has no stored frames, no frame of it has a true pose although it has ground truth,
+            or it has no frames for a sample.
     """
 
     def __init__(
@@ -66,6 +67,11 @@ class SequenceDataset(Dataset[Sample], ABC):
         truth = sequence.groundtruth
         self._T_wc = None if truth is None else truth.poses_at(sequence.stamps)
         has_pose = torch.ones(len(sequence), dtype=torch.bool) if truth is None else _is_known(truth, sequence.stamps)
+        if len(sequence) and not has_pose.any():
+            raise InputError(
+                f"{sequence.name}: none of its {len(sequence)} frames has a true pose; check that stamps and ground"
+                " truth belong to the same recording"
+            )
         starts = torch.arange(0, max(0, len(sequence) - max(offsets)), step)
         are_known = torch.stack([has_pose[starts + offset] for offset in offsets]).all(dim=0)
         self.indices: list[int] = starts[are_known].tolist()

@@ -13,7 +13,7 @@ from v3d_torch.datasets.depth_files import read_depth_file
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
-from v3d_torch.datasets.stored import ReadGroundTruth
+from v3d_torch.datasets.stored import ReadGroundTruth, first_readable
 
 
 class PairedImages(ImageSequence):
@@ -48,7 +48,7 @@ class PairedImages(ImageSequence):
             folder,
             published,
             depth_scale=depth_scale,
-            image_size=lambda: self._image_size(folder, pairs[0]),
+            image_size=lambda: first_readable(lambda pair: self._image_size(folder, pair), pairs),
         )
         stamps, delays = [pair.stamp for pair in pairs], [pair.depth_delay for pair in pairs]
         super().__init__(name or folder.resolve().name, stamps, chosen, groundtruth, delays)

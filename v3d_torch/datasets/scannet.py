@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,6 +18,7 @@ from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.paired_images import PairedImages
+from v3d_torch.datasets.stored import first_readable
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -53,7 +55,7 @@ class ScanNetSequence(PairedImages):
             pairs,
             camera if camera is not None else camera_file(folder),
             lambda: read_poses({stamp: pose_files[number] for number, stamp in stamps.items() if number in pose_files}),
-            published=lambda: _depth_camera(frames, pairs[0]),
+            published=lambda: first_readable(partial(_depth_camera, frames), pairs),
             depth_scale=_DEPTH_SCALE,
             name=folder.resolve().name,
         )

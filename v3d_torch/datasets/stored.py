@@ -6,6 +6,7 @@ import operator
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -17,6 +18,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
 
+_S = TypeVar("_S")
 _T = TypeVar("_T")
 
 ReadGroundTruth = Callable[[], Trajectory | None]
@@ -30,6 +32,22 @@ larger. A sequence with more broken frames was probably copied incompletely, or 
 def max_broken_frames(frames: int) -> int:
     """Return the maximum number of broken frames that can be skipped in a sequence of this length."""
     return max(int(_MAX_BROKEN_FRACTION * frames), _MIN_BROKEN_LIMIT)
+
+
+def first_readable(read: Callable[[_S], _T], frames: Sequence[_S]) -> _T:
+    """Read the first frame that is not broken, of as many frames as can be skipped and one more.
+
+    Args:
+        read: Function that reads something of a frame, and raises InputError if the frame is broken.
+        frames: Frames, at least one, such as their indices or their files.
+
+    Raises:
+        InputError: If none of these frames can be read; the error is that of the first one.
+    """
+    for frame in frames[: max_broken_frames(len(frames)) + 1]:
+        with suppress(InputError):
+            return read(frame)
+    return read(frames[0])
 
 
 class StoredSequence(ABC):

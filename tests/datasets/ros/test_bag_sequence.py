@@ -284,6 +284,18 @@ def test_depth_without_common_stamps_is_an_input_error(tmp_path: Path) -> None:
         load_sequence(str(write_with_other_depth(tmp_path, stamp=20)))
 
 
+def test_first_frame_that_is_broken_can_be_skipped(tmp_path: Path) -> None:
+    messages = valid_messages(ROS2)
+    image = next(message for topic, _, message in messages if topic == RGB)
+    image.data = image.data[:10]
+    path = ROS2.write(tmp_path / "take", messages)
+    with pytest.raises(InputError, match="has less data than its"):
+        load_sequence(path)
+    sequence = load_sequence(path, skip_broken=True)
+    assert isinstance(sequence, BagSequence)
+    assert_frame(sequence, 1, 1)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("keep", [0, 60, 0.5])
 def test_truncated_bag_is_an_input_error(kind: Kind, keep: float, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
-from v3d_torch.datasets.stored import Cursor
+from v3d_torch.datasets.stored import Cursor, first_readable
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_scale import MILLIMETRES
@@ -104,7 +104,7 @@ class BagSequence(ImageSequence):
         self._colour_messages, self._depth_messages = (
             Cursor(partial(_read_messages, path, topic)) for topic in (topics.rgb, topics.depth)
         )
-        self._read(0)  # raise errors that concern every frame here, and not later
+        first_readable(self._read, range(len(self)))  # raise errors that concern every frame here, and not later
         read, start = partial(_read_messages, path), float(self.stamps[0])
         self.gravity = read_gravity(path, types, read, topics.rgb, colour_frame, start)
 
