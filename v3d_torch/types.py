@@ -312,7 +312,12 @@ class Trajectory:
 
         Returns:
             Camera-to-world poses, float64, shape :math:`(K, 4, 4)`.
+
+        Raises:
+            InputError: If the trajectory has no poses.
         """
+        if len(self) == 0:
+            raise InputError("the trajectory has no poses to interpolate; give one with at least one pose")
         before = (torch.searchsorted(self.stamps, stamps, right=True) - 1).clamp(min=0)
         after = (before + 1).clamp(max=len(self) - 1)
         span = (self.stamps[after] - self.stamps[before]).clamp(min=torch.finfo(torch.float64).tiny)  # 0 at the end

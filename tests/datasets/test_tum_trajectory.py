@@ -176,6 +176,12 @@ def test_invalid_trajectory_arguments_are_rejected(stamps: object, T_wc: object,
         Trajectory(stamps, T_wc)
 
 
+def test_poses_of_an_empty_trajectory_are_an_input_error() -> None:
+    empty = Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
+    with pytest.raises(InputError, match=r"^the trajectory has no poses to interpolate; give"):
+        empty.poses_at(torch.ones(2, dtype=torch.float64))
+
+
 def test_invalid_trajectory_is_not_written(tmp_path: Path) -> None:
     path, good = tmp_path / "out.txt", random_trajectory(2, 0)
     with pytest.raises(InputError, match=r"^write_trajectory: expected a Trajectory, got .*Path"):
@@ -186,3 +192,12 @@ def test_invalid_trajectory_is_not_written(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"out\.txt: pose 1 is not a valid rigid transform"):
             write_trajectory(path, Trajectory(good.stamps, T_wc))
     assert not path.exists()
+
+
+@pytest.mark.parametrize(("row", "column", "change"), [(0, 0, 0.5), (0, 1, 0.5), (3, 3, 0.5), (3, 0, 0.5)])
+def test_matrix_that_is_no_rigid_transform_is_not_written(row: int, column: int, change: float, tmp_path: Path) -> None:
+    """It is scaled along an axis, sheared, or has another last row."""
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    T_wc[2, row, column] += change
+    with pytest.raises(InputError, match=r"out\.txt: pose 2 is not a valid rigid transform"):
+        write_trajectory(tmp_path / "out.txt", Trajectory(torch.arange(3, dtype=torch.float64), T_wc))

@@ -13,7 +13,16 @@ from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import adjoint, interpolate, invert, left_jacobian_inverse, orthonormalise, se3_exp, se3_log
+from v3d_torch.geometry.se3 import (
+    adjoint,
+    are_rigid,
+    interpolate,
+    invert,
+    left_jacobian_inverse,
+    orthonormalise,
+    se3_exp,
+    se3_log,
+)
 
 
 def tangents(angle: float, count: int = 64) -> Tensor:
@@ -127,6 +136,18 @@ def test_orthonormalised_chain_of_poses_stays_rigid() -> None:
     assert pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     identity = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(pose[:3, :3] @ pose[:3, :3].T, identity, rtol=0, atol=1e-12)
+
+
+def test_rigid_motions_are_recognised_up_to_a_tolerance() -> None:
+    T = se3_exp(tangents(2.0, 6)).reshape(2, 3, 4, 4)
+    assert are_rigid(T, 1e-12).tolist() == [[True] * 3] * 2
+    for index, wrong in enumerate((2.0, -1.0, torch.nan)):
+        T[0, index, :3, :3] *= wrong
+    T[1, 0, 3, 0] = 1e-3
+    T[1, 1, 0, 0] += 0.005
+    assert are_rigid(T, 1e-6).tolist() == [[False] * 3, [False, False, True]]
+    assert are_rigid(T, 0.01).tolist() == [[False] * 3, [False, True, True]]
+    assert are_rigid(T[1, 2].float(), 1e-5).shape == () and are_rigid(T[:0], 0.01).shape == (0, 3)
 
 
 def test_interpolation_turns_like_slerp_and_reaches_both_ends() -> None:

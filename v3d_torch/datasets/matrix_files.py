@@ -11,14 +11,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE
+from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE, ROTATION_TOLERANCE
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
 from v3d_torch.io.text import numbered_lines, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
-
-_ROTATION_TOLERANCE = 0.01
-"""Maximum deviation of an element of R R^T from the identity: files with few digits round their rotations."""
 
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
@@ -65,12 +63,7 @@ def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
             raise InputError(f"{path}: is not a 4x4 pose matrix; copy it again")
         if not np.isfinite(T_wc).all():
             continue
-        R = T_wc[:3, :3]
-        if (
-            np.abs(T_wc).max() > MAX_DISTANCE
-            or np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE
-            or np.linalg.det(R) < 0
-        ):
+        if np.abs(T_wc).max() > MAX_DISTANCE or not are_rigid(torch.from_numpy(T_wc), ROTATION_TOLERANCE):
             raise InputError(f"{path}: is not a valid rigid transform; copy it again")
         poses[stamp] = T_wc
     if not poses:

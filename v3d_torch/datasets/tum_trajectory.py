@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.text import numbered_lines, replace_odd_spaces
@@ -18,6 +19,9 @@ from v3d_torch.types import Trajectory
 
 MAX_DISTANCE = 1e7
 """Maximum coordinate of a position, metres: the order of the earth's radius, for poses in a geocentric frame."""
+
+ROTATION_TOLERANCE = 0.01
+"""Maximum deviation of an element of R R^T from the identity: files with few digits round their rotations."""
 
 _MAX_QUATERNION_NORM = 1e3
 """Maximum norm of a quaternion; its inverse is the minimum. Rounding and other scales stay within this range."""
@@ -82,10 +86,9 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
             f"write_trajectory: expected a Trajectory, got {type(trajectory).__name__}; pass the path first"
         )
     T_wc = trajectory.T_wc.detach().numpy()
-    with np.errstate(invalid="ignore"):
-        rigid = np.isfinite(T_wc).all(axis=(1, 2)) & (np.linalg.det(T_wc[:, :3, :3]) > 0)
-    if not rigid.all():
-        raise InputError(f"{path}: pose {rigid.argmin()} is not a valid rigid transform; repair or remove it")
+    is_rigid = are_rigid(trajectory.T_wc.detach(), ROTATION_TOLERANCE).numpy()
+    if not is_rigid.all():
+        raise InputError(f"{path}: pose {is_rigid.argmin()} is not a valid rigid transform; repair or remove it")
     lines = [] if comment is None else [f"# {comment}\n"]
     if len(trajectory):
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)

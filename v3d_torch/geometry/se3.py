@@ -92,6 +92,25 @@ def orthonormalise(T: Tensor) -> Tensor:
     return _assemble(torch.where(is_unknown, torch.nan, U @ Vh), T[..., :3, 3:])
 
 
+def are_rigid(T: Tensor, tolerance: float) -> Tensor:
+    r"""Check whether matrices are rigid motions, up to the rounding of their rotations.
+
+    Args:
+        T: Matrices, floating point, shape :math:`(..., 4, 4)`.
+        tolerance: Maximum difference between an element of :math:`R R^T` and of the identity.
+
+    Returns:
+        True for finite matrices with a rotation that is no reflection, and (0, 0, 0, 1) as last row, bool, shape
+        :math:`(...)`.
+    """
+    R = T[..., :3, :3]
+    identity = torch.eye(4, dtype=T.dtype, device=T.device)
+    error = (R @ R.mT - identity[:3, :3]).abs().amax(dim=(-2, -1))
+    is_affine = (T[..., 3, :] == identity[3]).all(dim=-1)
+    # A comparison with NaN is false.
+    return T.isfinite().all(dim=(-2, -1)) & is_affine & (error <= tolerance) & (torch.linalg.det(R) > 0)
+
+
 def _assemble(R: Tensor, t: Tensor) -> Tensor:
     """Matrices (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3, 1), with an exact last row."""
     last = torch.eye(4, dtype=R.dtype, device=R.device)[3:].expand(*R.shape[:-2], 1, 4)

@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from v3d_torch.geometry.se3 import are_rigid
+
 _MAX_RIGID_ERROR = 1e-3
 """Maximum difference between R R^T and the identity: transforms computed in float32 are well below."""
 
@@ -38,11 +40,7 @@ def _are_pairs(pairs: Tensor, sizes: Mapping[str, int]) -> bool:
 
 
 def _is_rigid(T: Tensor, sizes: Mapping[str, int]) -> bool:
-    R = T[:3, :3]
-    error = (R @ R.T - torch.eye(3, dtype=T.dtype)).abs().max()
-    is_affine = torch.equal(T[3], T.new_tensor([0.0, 0.0, 0.0, 1.0]))
-    # A comparison with NaN is false.
-    return bool(T.isfinite().all() and is_affine and error < _MAX_RIGID_ERROR and torch.linalg.det(R) > 0)
+    return bool(are_rigid(T, _MAX_RIGID_ERROR))
 
 
 def _are_histograms(rows: Tensor, sizes: Mapping[str, int]) -> bool:
