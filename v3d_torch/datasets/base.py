@@ -78,6 +78,6 @@ class HasMotionMasks(Protocol):
         """Return the ground-truth motion mask of frame ``index``; None if unknown.
 
         Returns:
-            Mask, uint8, shape :math:`(H, W)`. 0 is static, 1-254 is the id of a moving person (the same in all
-            frames), 255 is excluded from evaluation (a person whose outline is only approximate).
+            Mask, uint8, shape :math:`(H, W)`. 0 is static, 1-254 is the id of a person or thing that moves (the same in
+            all frames), 255 is excluded from evaluation (a person whose outline is only approximate).
         """

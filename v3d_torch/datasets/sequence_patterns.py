@@ -128,7 +128,7 @@ def _match_names(pattern: str) -> list[str]:
     for full in dict.fromkeys([*PAPER_SEQUENCES, *SEQUENCES]):
         long = full.removeprefix("rgbd_dataset_")
         spellings = (full, long, long.replace("freiburg", "fr"), _normalise(short_name(full)))
-        if full.endswith("_validation") > ("validation" in normalised):
+        if full.endswith("_validation") and "validation" not in normalised:
             continue
         if any(fnmatchcase(spelling, normalised) for spelling in spellings):
             found.append(short_name(full))

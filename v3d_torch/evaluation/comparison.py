@@ -114,4 +114,4 @@ def _cell(ratios: Sequence[float]) -> Cell:
     if not ratios:
         return Cell("-", best=False)
     ratio = mean_ratio(ratios)
-    return Cell(str(ratio), best=ratio.high < 1, worse=ratio.low > 1)
+    return Cell(str(ratio), best=ratio.is_significant and ratio.mean < 1, worse=ratio.is_significant and ratio.mean > 1)

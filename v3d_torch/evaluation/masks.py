@@ -93,8 +93,8 @@ class MaskEvaluation:
 
         Args:
             stamp: Timestamp, seconds.
-            truth: Ground-truth mask: 0 for static pixels, 1-254 for the id of a person, 255 for neither, uint8, shape
-                :math:`(H, W)`.
+            truth: Ground-truth mask: 0 for static pixels, 1-254 for the id of a person or thing that moves, 255 for
+                neither, uint8, shape :math:`(H, W)`.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             masked: Masked pixels, bool, shape :math:`(H, W)`.
             objects: Mask of each object by its id (> 0), bool, shape :math:`(H, W)`; masks can overlap.

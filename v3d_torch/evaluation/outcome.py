@@ -34,7 +34,10 @@ class Outcome:
 
     @property
     def warnings(self) -> list[str]:
-        """Contradictions between the images and the camera, one sentence each; empty for a failed run."""
+        """Contradictions between images and camera, notes on the source, and map files that were not written.
+
+        They are one sentence each. A failed run has none.
+        """
         return list(self.metrics.get("warnings", ()))
 
     @property

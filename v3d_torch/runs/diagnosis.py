@@ -13,6 +13,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.types import RGBDFrame, TrackingStatus
 
@@ -115,7 +116,7 @@ def _cause_of_loss(pipeline: Pipeline, indices: Tensor) -> str:
             )
     has_masked_objects = torch.isin(indices, pipeline.record.dynamics.frames_with_masked_objects())
     if 2 * int(has_masked_objects.sum()) > len(indices):
-        return "masked objects cover the images; see figures/masks.png, and try --segmenter none"
+        return f"masked objects cover the images; see {RunFile.MASKS_FIGURE}, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"
 
 

@@ -22,14 +22,14 @@ _BYTES_PER_PIXEL = 500
 """Memory of a run for each pixel of an image, measured on sequences of 640x360 to 1920x1080 pixels."""
 
 
-def open_sequence(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
+def open_sequence(name: str, data_root: Path | None, console: Console) -> RGBDSequence:
     """Open a sequence as `load_sequence` does, with a progress bar for downloads, and print notes on it."""
-    sequence = _load(name, data_root, console, skip_broken=skip_broken)
+    sequence = _load(name, data_root, console)
     print_notes(sequence, console)
     return sequence
 
 
-def _load(name: str, data_root: Path | None, console: Console, *, skip_broken: bool) -> RGBDSequence:
+def _load(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
     with progress_bars(console) as progress:
         bar = ProgressBar(progress, "sequence")
         return load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)

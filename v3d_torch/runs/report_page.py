@@ -18,7 +18,7 @@ from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.evaluation import note_too_few_poses
 from v3d_torch.io.image_file import read_image
-from v3d_torch.runs.file_names import FIGURES, MASKS
+from v3d_torch.runs.file_names import MASKS, RunFile
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.runs.wall_time import describe_wall_time
 from v3d_torch.viz.figure_output import embed_image, embed_svg
@@ -28,18 +28,18 @@ from v3d_torch.viz.stage_times import draw_stage_bars, draw_stages_over_time
 from v3d_torch.viz.trajectory_figure import draw_trajectory
 
 _FIGURES = {
-    "masks.png": "Frames with the mask of each object in the colour of its motion state.",
-    "voting.png": "Frame with the most votes for dynamic objects: a line connects two objects, one of which voted for"
-    " the other over some time span. The number of an object is that of the time span with the most votes, plus one if"
-    " the free-space check agrees.",
-    "clusters.png": "Point clouds of the objects in the frame with the most votes for dynamic objects, or with the most"
-    " objects if there are no votes, before and after outlier rejection.",
-    "objects.png": "The room from above: path and last box of the objects in the colour of their motion state, with an"
-    " arrow to where a dynamic object would be a second later.",
-    "occupancy.png": "Occupancy map from above: the distance to obstacles and, if the floor is visible, its free and"
-    " occupied parts.",
+    RunFile.MASKS_FIGURE: "Frames with the mask of each object in the colour of its motion state.",
+    RunFile.VOTING_FIGURE: "Frame with the most votes for dynamic objects: a line connects two objects, one of which"
+    " voted for the other over some time span. The number of an object is that of the time span with the most votes,"
+    " plus one if the free-space check agrees.",
+    RunFile.CLUSTERS_FIGURE: "Point clouds of the objects in the frame with the most votes for dynamic objects, or with"
+    " the most objects if there are no votes, before and after outlier rejection.",
+    RunFile.OBJECTS_FIGURE: "The room from above: path and last box of the objects in the colour of their motion state,"
+    " with an arrow to where a dynamic object would be a second later.",
+    RunFile.OCCUPANCY_FIGURE: "Occupancy map from above: the distance to obstacles and, if the floor is visible, its"
+    " free and occupied parts.",
 }
-"""Caption of each picture in the folder ``figures`` of a run."""
+"""Caption of each picture of a run."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ def render_page(run: StoredRun) -> str:
         objects=_object_plot(run),
         masked=_masked_percentages(run.metrics.masks or {}),
         pictures=[
-            (embed_image(run.folder / FIGURES / name), caption)
+            (embed_image(run.folder / name), caption)
             for name, caption in _FIGURES.items()
-            if (run.folder / FIGURES / name).is_file()
+            if (run.folder / name).is_file()
         ],
         stages=stages,
         describe_wall_time=describe_wall_time,

@@ -108,7 +108,8 @@ class RunRequest:
 
         Raises:
             ValueError: If a value of the configuration is not valid.
-            TypeError: If a key is missing or unknown.
+            KeyError: If the configuration is missing.
+            TypeError: If another key is missing or unknown.
         """
         return RunRequest(**{**values, "config": Config.model_validate(values["config"])})
 
