@@ -419,12 +419,6 @@ def test_name_in_a_suggested_command_is_quoted(recording: Path, tmp_path: Path) 
         load_sequence(path)
 
 
-def test_recording_with_a_suffix_in_upper_case_is_an_input_error(recording: Path, tmp_path: Path) -> None:
-    path = shutil.copyfile(recording, tmp_path / "TAKE.DB3")
-    with pytest.raises(InputError, match=r"TAKE\.DB3: librealsense needs .*; rename the file to TAKE\.db3$"):
-        open_source(path)
-
-
 def test_recording_is_a_stream_not_a_sequence(recording: Path) -> None:
     with pytest.raises(InputError, match=r"take.db3: is a stream, .*with v3d-torch record --seq"):
         load_sequence(str(recording))

@@ -79,20 +79,6 @@ def test_folder_of_a_ros2_bag_can_be_named_like_a_ros1_bag(kind: Kind, tmp_path:
     assert_frame(sequence, 2, 2)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_suffix_in_upper_case_is_accepted(kind: Kind, tmp_path: Path) -> None:
-    make = MessageFactory(kind)
-    path = make.write(tmp_path / "take", valid_messages(make))
-    file = path if kind == "bag" else next(path.glob(f"*.{kind}"))
-    sequence = load_sequence(str(file.rename(tmp_path / f"TAKE.{kind.upper()}")))
-    assert isinstance(sequence, BagSequence) and sequence.name == "TAKE"
-    assert_frame(sequence, 2, 2)
-    damaged = tmp_path / f"DAMAGED.{kind.upper()}"
-    damaged.write_bytes(b"")
-    with pytest.raises(InputError, match=r"is damaged or not a bag .*, or repair it with (rosbag|mcap|ros2 bag) re"):
-        load_sequence(str(damaged))
-
-
 def test_unset_header_stamps_are_replaced_by_arrival_times(tmp_path: Path) -> None:
     messages = valid_messages(ROS2)
     for topic, _, message in messages:

@@ -155,13 +155,7 @@ def _choose_camera(name: str, device: Device, camera: CameraChoice) -> PinholeCa
 
 
 def open_realsense_recording(path: Path, camera: CameraChoice = None) -> RealSenseStream:
-    """Open a file that RealSense software recorded as a stream.
-
-    Raises:
-        InputError: If the file cannot be opened, see `open_recorded_device`.
-    """
-    if path.suffix.lower() == ".db3" != path.suffix:  # read as the older format by librealsense
-        raise InputError(f"{path}: librealsense needs the suffix in lower case; rename the file to {path.stem}.db3")
+    """Open a file that RealSense software recorded as a stream, see `open_recorded_device`."""
     return RealSenseStream(path.resolve().stem, partial(open_recorded_device, path), camera)
 
 
@@ -170,5 +164,5 @@ def is_realsense_recording(path: Path) -> bool:
 
     Such a bag needs librealsense: its depth is not aligned to colour, and it has no CameraInfo of ROS.
     """
-    is_bag_file = path.suffix.lower() in (".bag", ".db3") and path.is_file()
+    is_bag_file = path.suffix in (".bag", ".db3") and path.is_file()
     return is_bag_file and any(topic.startswith("/device_0/") for topic in read_topic_types(path))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,7 +128,7 @@ class BagSequence(ImageSequence):
 def is_bag(path: Path) -> bool:
     """Check whether a path is a file with the suffix of a bag, or the folder of a ROS 2 bag."""
     metadata = path / "metadata.yaml"
-    return (path.suffix.lower() in (".bag", ".db3", ".mcap") and path.is_file()) or (
+    return (path.suffix in (".bag", ".db3", ".mcap") and path.is_file()) or (
         metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(encoding="utf-8", errors="replace")
     )
 
@@ -154,12 +154,12 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
         raise InputError(f"{path}: reading a bag needs rosbags ({error}); run pip install rosbags") from error
     # The definitions of images and cameras are the same in all versions of ROS 1, and in all of ROS 2. The definitions
     # in the bag are not parsed, so that a malformed definition of an unrelated topic causes no error.
-    is_ros1 = path.suffix.lower() == ".bag" and path.is_file()  # the folder of a ROS 2 bag can have any name
+    is_ros1 = path.suffix == ".bag" and path.is_file()  # the folder of a ROS 2 bag can have any name
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.LATEST)
     if is_ros1:  # rosbags lacks the message of transforms
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     try:
-        reader = Reader1(path) if is_ros1 else _ros2_reader(path, Reader2)
+        reader = Reader1(path) if is_ros1 else Reader2(path)
         reader.open()
     except Exception as error:
         raise _damaged_bag_error(path, error) from error
@@ -169,21 +169,9 @@ def _open_bag(path: Path) -> Iterator[tuple[Reader1 | Reader2, Callable[[bytes, 
         reader.close()
 
 
-def _ros2_reader(path: Path, reader: type[Reader2]) -> Reader2:
-    """Make the reader of a ROS 2 bag; rosbags knows the suffixes of files in lower case only."""
-
-    class AnyCaseReader(reader):  # type: ignore[misc, valid-type]
-        STORAGE_PLUGINS: ClassVar = {
-            path.suffix if suffix == path.suffix.lower() else suffix: plugin
-            for suffix, plugin in reader.STORAGE_PLUGINS.items()
-        }
-
-    return AnyCaseReader(path)
-
-
 def _damaged_bag_error(path: Path, error: Exception) -> InputError:
     # rosbags does not wrap the errors of the libraries that it uses for each format.
-    repair = _REPAIR_COMMANDS[path.suffix.lower()] if path.is_file() else "ros2 bag reindex"
+    repair = _REPAIR_COMMANDS[path.suffix] if path.is_file() else "ros2 bag reindex"
     return InputError(
         f"{path}: is damaged or not a bag ({first_line(error)}); copy it again, or repair it with {repair}"
     )
