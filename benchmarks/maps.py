@@ -52,16 +52,17 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
     views, masked, unmasked = (StaticViews(sequence.camera, config.dense_map.stride) for _ in range(3))
     for frame in sequence:
         objects = slam(frame)
-        keyframes = slam.map.keyframes
-        if not keyframes or keyframes[-1].frame != frame.index:
+        keyframe = slam.map.keyframe_at(frame.stamp)
+        if keyframe is None:
             continue
         truth = sequence.motion_mask(frame.index) if isinstance(sequence, HasMotionMasks) else None
         if truth is None:
             raise InputError(f"{sequence.name}: frame {frame.index} has no true mask; choose another sequence")
         white = ((truth > 0) & (truth < 255)).to(torch.uint8).mul(255).expand(3, -1, -1)
-        views.add(keyframes[-1], frame.image, frame.depth, objects.static_without_people)
-        masked.add(keyframes[-1], white, frame.depth, objects.static_without_people)
-        unmasked.add(keyframes[-1], white, frame.depth, torch.ones_like(objects.static_without_people))
+        static, motion = objects.static_without_people, (frame.depth_delay, objects.twist)
+        views.add(keyframe, frame.image, frame.depth, static, *motion)
+        masked.add(keyframe, white, frame.depth, static, *motion)
+        unmasked.add(keyframe, white, frame.depth, torch.ones_like(static), *motion)
     return slam, views, {"classified as static": masked, "all": unmasked}
 
 
