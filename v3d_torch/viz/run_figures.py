@@ -12,7 +12,6 @@ from v3d_torch.objects.frame_objects import TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
 from v3d_torch.reconstruction.point_map import PointMap
-from v3d_torch.runs.file_names import RunFile
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure
 from v3d_torch.viz.figure_output import save_figure
@@ -36,30 +35,26 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
     Raises:
         OutputError: If an image cannot be written.
     """
-
-    def path(figure: RunFile) -> Path:
-        return folder / Path(figure).name
-
     sequence, record = pipeline.sequence, pipeline.record
     poses = pipeline.slam.poses
     groundtruth = sequence.groundtruth if poses.is_localised else None  # lost poses cannot be aligned to it
-    save_trajectory_figure(groundtruth, trajectory, path(RunFile.TRAJECTORY_FIGURE), sequence.name, poses.statuses)
+    save_trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", sequence.name, poses.statuses)
     if record.snapshots:
         images = [snapshot.frame.image for snapshot in record.snapshots]
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
-        save_mask_figure(images, overlays, path(RunFile.MASKS_FIGURE))
+        save_mask_figure(images, overlays, folder / "masks.png")
     if len(record.dynamics):
         figure = draw_objects(record.dynamics, trajectory, point_map.points, pipeline.slam.up, sequence.name)
-        save_figure(figure, path(RunFile.OBJECTS_FIGURE))
+        save_figure(figure, folder / "objects.png")
     mapper = pipeline.slam.occupancy
     if mapper is not None and not mapper.map.is_empty:
         up, floor = mapper.up.direction, mapper.find_floor()
-        save_figure(draw_occupancy(mapper.map, trajectory, up, floor, sequence.name), path(RunFile.OCCUPANCY_FIGURE))
+        save_figure(draw_occupancy(mapper.map, trajectory, up, floor, sequence.name), folder / "occupancy.png")
     snapshot = record.most_dynamic_snapshot
     if snapshot is not None and snapshot.result.vote_pairs:
-        _draw_votes(path(RunFile.VOTING_FIGURE), pipeline, snapshot, _title(snapshot, trajectory))
+        _draw_votes(folder / "voting.png", pipeline, snapshot, _title(snapshot, trajectory))
     if snapshot is not None and (clusters := _clusters(pipeline, snapshot)):
-        save_clusters_figure(clusters, path(RunFile.CLUSTERS_FIGURE), _title(snapshot, trajectory))
+        save_clusters_figure(clusters, folder / "clusters.png", _title(snapshot, trajectory))
 
 
 def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot, title: str) -> None:
