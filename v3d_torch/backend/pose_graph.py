@@ -244,6 +244,8 @@ def _prepare(
         information = identity.expand(count, 6, 6)
     if weights is None:
         weights = torch.ones(count, dtype=torch.float64, device=device)
+    else:
+        check_weights(weights, mask_or_all(valid, weights))
     T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
     edges = fill_indices("edges", edges, T_wc.shape[-3], None if valid is None else valid[..., None])
     if valid is not None:
@@ -251,7 +253,6 @@ def _prepare(
         information = torch.where(valid[..., None, None], information, identity)
     check_finite_arguments(T_wc=T_wc, T_ij=T_ij, information=information)
     weights = fill_padding(weights, valid, 0.0)
-    check_weights(weights, mask_or_all(None, weights))
     batch = common_batch(
         T_wc.shape[:-3],
         edges.shape[:-2],

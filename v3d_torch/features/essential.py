@@ -88,9 +88,11 @@ def essential_ransac(
     KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    weights = torch.ones_like(uv_a[..., 0]) if weights is None else weights
     valid = mask_or_all(valid, uv_a[..., 0]) & uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
-    check_weights(weights, valid)
+    if weights is None:
+        weights = torch.ones_like(uv_a[..., 0])
+    else:
+        check_weights(weights, valid)
     batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], weights.shape[:-1], valid.shape[:-1])
     mask, row = valid.expand(*batch, -1), valid[..., None]
     problem = EpipolarProblem(

@@ -183,7 +183,7 @@ def se3_log(T: Tensor) -> Tensor:
 
 
 def transform_points(T_ba: Tensor, points: Tensor) -> Tensor:
-    """Transform points from frame a to frame b.
+    """Transform points from frame a to frame b; batch dimensions are broadcast.
 
     Args:
         T_ba: Transform, shape :math:`(*, 4, 4)`; converted to the dtype of the points.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from v3d_torch.features.features import Features
 from v3d_torch.features.scale_pyramid import octaves_of_levels
-from v3d_torch.geometry.se3 import orthonormalise
+from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.landmark_ids import compacted_ids, find_landmarks_in_use
 from v3d_torch.mapping.map_tables import MapTables
@@ -31,8 +31,8 @@ OPTIONAL_COLUMNS: Columns = {
 _MIN_SIGMA_RATIO = torch.finfo(torch.float64).tiny
 """Smallest positive number: standard deviations are not zero."""
 
-_MOTION_TOLERANCE = 1e-6
-"""Maximum difference of an element of a rigid motion from the nearest exact one."""
+_ROTATION_TOLERANCE = 5e-7
+"""Maximum difference between an element of R R^T and of the identity: rotations are stored in float64."""
 
 
 def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
@@ -159,16 +159,10 @@ def find_inconsistency(columns: Columns, sparse_map: SparseMap, views: StaticVie
         if not bool(((columns[name] >= minimum) & (columns[name] < end)).all()):
             return f"{name} has values out of range"
     for name in ("keyframe/T_cw", "loop/T_ij", "view/T_dc"):
-        if not _are_rigid_motions(columns[name]):
+        if not bool(are_rigid(columns[name], _ROTATION_TOLERANCE).all()):
             return f"{name} has matrices that are not rigid motions"
     reference = columns["keyframe/reference"]
     return None if torch.equal(reference[reference], reference) else "keyframe/reference refers to a culled keyframe"
-
-
-def _are_rigid_motions(T: Tensor) -> bool:
-    """Check whether matrices are rigid motions, up to rounding, float64, shape (N, 4, 4)."""
-    is_near = (T - orthonormalise(T)).abs() <= _MOTION_TOLERANCE
-    return bool(is_near.all() and (torch.linalg.det(T) > 0).all())
 
 
 def _empty_tables() -> tuple[TensorTable, TensorTable]:

@@ -71,7 +71,6 @@ class StaticViews:
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
         self.stride = stride
-        self._depth_delay = camera.depth_delay
         self.camera = PinholeCamera(
             fx=camera.fx / stride,
             fy=camera.fy / stride,
@@ -79,6 +78,7 @@ class StaticViews:
             cy=camera.cy / stride,
             width=-(-camera.width // stride),
             height=-(-camera.height // stride),
+            depth_delay=camera.depth_delay,
         )
         rows, columns = torch.arange(0, camera.height, stride), torch.arange(0, camera.width, stride)
         v, u = torch.meshgrid(rows, columns, indexing="ij")
@@ -126,11 +126,12 @@ class StaticViews:
                 camera's own delay is added.
             twist: Twist of the camera at the time of the colour image, see `CameraState`; None for a camera at rest.
         """
-        motion = torch.zeros(6, dtype=torch.float64) if twist is None else twist * (depth_delay + self._depth_delay)
+        twist = torch.zeros(6, dtype=torch.float64) if twist is None else twist
+        T_dc = se3_exp(-twist * (depth_delay + self.camera.depth_delay))
         units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
         units = torch.where(keep, units, 0).to(torch.uint16)
-        self.append(StaticView(keyframe, units, image[:, self._v, self._u], se3_exp(-motion), depth_delay))
+        self.append(StaticView(keyframe, units, image[:, self._v, self._u], T_dc, depth_delay))
 
     def append(self, view: StaticView) -> None:
         """Append a view, and remove the views of keyframes that were culled.

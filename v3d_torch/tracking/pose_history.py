@@ -22,8 +22,7 @@ class PoseHistory:
 
     Attributes:
         last_localised: Time of the last frame that was found, seconds; minus infinity if there is none.
-        observed_landmarks: IDs of the landmarks that the last frame observed that observed any, int64, shape
-            :math:`(L,)`.
+        observed_landmarks: IDs of the landmarks of the last frame that observed landmarks, int64, shape :math:`(L,)`.
     """
 
     def __init__(self) -> None:

@@ -11,6 +11,7 @@ from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.types import Trajectory
 
 PATH_COLOURS = {"odometry": "#ff7f0e", "disconnected": "#d62728", "lost": "#d62728", "earlier": "#7f7f7f"}
@@ -58,7 +59,7 @@ def make_camera_path(
     corners = torch.tensor([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [right / 2, -0.15 * bottom]])
     image = camera.back_project(corners.to(torch.float64), torch.full((5,), FRUSTUM_DEPTH, dtype=torch.float64))
     frustum = torch.cat([image.new_zeros(1, 3), image])
-    frustums = frustum @ T_wk[:, :3, :3].mT + T_wk[:, None, :3, 3]
+    frustums = transform_points(T_wk, frustum)
     first_vertex = len(trajectory) + len(frustum) * torch.arange(len(T_wk))[:, None, None]
     colours = _colours(trajectory.stamps, statuses)
     indices = torch.arange(len(trajectory))

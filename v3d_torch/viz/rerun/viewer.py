@@ -226,4 +226,4 @@ def _frustums(camera: PinholeCamera, T_wc: Tensor) -> list[NDArray[np.float64]]:
     points[:4, :2] = (corners - camera.K[:2, 2]) / camera.K.diagonal()[:2] * FRUSTUM_DEPTH
     points[:4, 2] = FRUSTUM_DEPTH
     line = points[[0, 1, 2, 3, 0, 4, 1, 2, 4, 3]]
-    return list((line @ T_wc[:, :3, :3].mT + T_wc[:, None, :3, 3]).numpy())
+    return list(transform_points(T_wc, line).numpy())
