@@ -135,6 +135,14 @@ def test_integer_depth_in_camera_units_becomes_metres(demo: RGBDSequence) -> Non
     assert RGBDFrame.from_arrays(0, 0.0, image, torch.full((480, 640), -1.0)).depth.unique().item() == 0.0
 
 
+def test_the_camera_corrects_depth_in_metres_and_in_its_units(demo: RGBDSequence) -> None:
+    assert demo.camera.depth_scale
+    image, camera = np.zeros((480, 640, 3), np.uint8), replace(demo.camera, inverse_depth_offset=0.01)
+    for depth in (np.full((480, 640), 2.0), np.full((480, 640), 2 * demo.camera.depth_scale).astype(np.uint16)):
+        frame = RGBDFrame.from_arrays(0, 0.0, image, depth, camera)
+        assert frame.depth.unique().item() == pytest.approx(1 / (1 / 2.0 + 0.01), rel=1e-6)
+
+
 @pytest.mark.parametrize(
     ("image", "depth"),
     [
@@ -251,8 +259,9 @@ def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(
     slam.register_stage_hook("free_space_check", lambda name, args, result: views.append(args[0]))
     for index in range(3):
         before = slam.poses.T_cw
-        slam(replace(demo[index], depth_delay=by_stamps, camera=camera))
+        result = slam(replace(demo[index], depth_delay=by_stamps, camera=camera))
     T_dc = se3_exp(motions[-1].velocity * delay)
+    assert torch.equal(result.T_dc, T_dc)
     assert float((T_dc - torch.eye(4)).abs().max()) > 1e-4  # the camera moves
     torch.testing.assert_close(views[-1].T_cw, T_dc @ motions[-1].T_cp @ before)
     stored = slam.free_space_check.state_dict()["views"][-1]

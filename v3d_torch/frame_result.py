@@ -77,5 +77,11 @@ class FrameResult(FrameObjects, CameraState):
 
     Later corrections of the pose are in `V3DSLAM.poses`.
 
-    It has the attributes of `CameraState` and those of `FrameObjects`.
+    It has the attributes of `CameraState`, those of `FrameObjects`, and one of its own.
+
+    Attributes:
+        T_dc: Motion of the camera from the time of the colour image to that of the depth image: it maps points of the
+            camera frame "c" at the former to "d" at the latter, float64, shape :math:`(4, 4)`.
     """
+
+    T_dc: Tensor

@@ -268,7 +268,7 @@ class V3DSLAM(FramePreprocessor):
         objects = self.classify_motion.apply_corrections(
             objects
         )  # corrections of the world since the objects were tracked
-        return FrameResult(**vars(objects), **vars(state))
+        return FrameResult(**vars(objects), **vars(state), T_dc=T_dc)
 
     def flush(self) -> None:
         """Apply the pending result of the back end. `track` does this in every frame; call it after the last frame."""

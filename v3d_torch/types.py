@@ -75,7 +75,8 @@ class RGBDFrame:
                 are accepted.
             depth: Depth registered to the colour image, shape :math:`(H, W)`: metres if floating point, else in the
                 units of the camera; 0 or NaN = no measurement.
-            camera: Camera of both images. Its depth scale and depth correction are applied to depth in whole numbers.
+            camera: Camera of both images. Its depth scale is applied to depth in whole numbers, its correction of depth
+                to all depth, as for stored sequences.
             depth_delay: Time of the depth image minus time of the colour image, seconds.
             gravity: Direction of gravity in the camera frame, of any length, shape :math:`(3,)`; None if it was not
                 measured. An accelerometer at rest measures the opposite direction.
@@ -116,7 +117,7 @@ class RGBDFrame:
                 f"frame {index}: depth is {measured.dtype}, {estimate_depth_scale([measured]).array_prompt}"
             )
         metres = depth_to_metres(measured, scale)
-        if measured.dtype.kind != "f" and camera is not None:
+        if camera is not None:
             metres = camera.correct_depth(metres)
         channels = torch.from_numpy(np.array(colour.transpose(2, 0, 1), order="C"))
         return RGBDFrame(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import STORED_UNIT
-from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe
 
 
@@ -78,7 +78,6 @@ class StaticViews:
             cy=camera.cy / stride,
             width=-(-camera.width // stride),
             height=-(-camera.height // stride),
-            depth_delay=camera.depth_delay,
         )
         rows, columns = torch.arange(0, camera.height, stride), torch.arange(0, camera.width, stride)
         v, u = torch.meshgrid(rows, columns, indexing="ij")
@@ -113,7 +112,7 @@ class StaticViews:
         depth: Tensor,
         static: Tensor,
         depth_delay: float = 0.0,
-        twist: Tensor | None = None,
+        T_dc: Tensor | None = None,
     ) -> None:
         """Store the static pixels of a keyframe as a view.
 
@@ -122,12 +121,11 @@ class StaticViews:
             image: RGB image, uint8, shape :math:`(3, H, W)`.
             depth: Depth image, metres, shape :math:`(1, H, W)`.
             static: Mask of static pixels, bool, shape :math:`(H, W)`.
-            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds; the
-                camera's own delay is added.
-            twist: Twist of the camera at the time of the colour image, see `CameraState`; None for a camera at rest.
+            depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
+            T_dc: Motion of the camera from the time of the colour image to that of the depth image, see `FrameResult`,
+                float64, shape :math:`(4, 4)`; None for a camera at rest.
         """
-        twist = torch.zeros(6, dtype=torch.float64) if twist is None else twist
-        T_dc = se3_exp(-twist * (depth_delay + self.camera.depth_delay))
+        T_dc = torch.eye(4, dtype=torch.float64) if T_dc is None else T_dc
         units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
         units = torch.where(keep, units, 0).to(torch.uint16)

@@ -248,7 +248,7 @@ class Pipeline:
         keyframe = self.slam.map.keyframe_at(frame.stamp)
         if keyframe is not None:
             static = result.static_without_people
-            self.views.add(keyframe, frame.image, frame.depth, static, frame.depth_delay, result.twist)
+            self.views.add(keyframe, frame.image, frame.depth, static, frame.depth_delay, result.T_dc)
             if not self.record.was_checked:
                 self.record.people_sizes += apparent_sizes(result.objects, frame.depth, self.slam.camera)
             is_due = self._live is None and not self.record.was_checked
