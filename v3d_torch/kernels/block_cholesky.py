@@ -8,17 +8,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats, Ints
 from v3d_torch.kernels.compiler import device
-from v3d_torch.kernels.reprojection import Array
-
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @device
-def order_by_degree(adjacent: Mask) -> tuple[Index, Index, Index]:
+def order_by_degree(adjacent: Bools) -> tuple[Ints, Ints, Ints]:
     """Order the rows of a symmetric matrix by minimum degree, which keeps the factor sparse.
 
     Args:
@@ -65,13 +61,13 @@ def order_by_degree(adjacent: Mask) -> tuple[Index, Index, Index]:
 
 
 @device
-def find_block(first: Index, row: Index, i: int, k: int) -> int:
+def find_block(first: Ints, row: Ints, i: int, k: int) -> int:
     """Index of the block in row i and column k."""
     return first[k] + np.searchsorted(row[first[k] : first[k + 1]], i)
 
 
 @device
-def factorise(first: Index, row: Index, blocks: Array) -> None:
+def factorise(first: Ints, row: Ints, blocks: Floats) -> None:
     """Replace the lower triangle of a positive definite matrix, (blocks, 6, 6), by its Cholesky factor.
 
     NaN results if the matrix is not positive definite.
@@ -106,7 +102,7 @@ def factorise(first: Index, row: Index, blocks: Array) -> None:
 
 
 @device
-def solve_factorised(first: Index, row: Index, blocks: Array, b: Array) -> None:
+def solve_factorised(first: Ints, row: Ints, blocks: Floats, b: Floats) -> None:
     """Replace the right-hand sides b, (n, 6), by the solution."""
     n = len(first) - 1
     for k in range(n):

@@ -5,13 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bytes, Floats32, Ints, Ints32
 from v3d_torch.kernels.compiler import device, kernel
-
-Image = NDArray[np.uint8]
-Points = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 _GATHER_BITS = np.uint64(0x01020408_10204080)
 """Factor that packs eight bytes of 0 or 1: the highest byte of the product contains their bits, the first as the
@@ -22,7 +18,7 @@ ROUNDING = np.float32(64.5)
 
 
 @device
-def _row_moments(row: Image) -> tuple[np.int32, np.int32]:
+def _row_moments(row: Bytes) -> tuple[np.int32, np.int32]:
     """Sum of the values of a row multiplied by their position, and their sum."""
     moment = total = np.int32(0)
     for i in range(np.int32(row.size)):
@@ -33,7 +29,7 @@ def _row_moments(row: Image) -> tuple[np.int32, np.int32]:
 
 
 @device
-def _direction(image: Image, x: int, y: int, half_widths: Ints) -> tuple[float, float]:
+def _direction(image: Bytes, x: int, y: int, half_widths: Ints) -> tuple[float, float]:
     """Cosine and sine of the direction from a corner to the intensity centroid of the disk around it."""
     m10 = m01 = np.int64(0)
     for dy in range(1 - len(half_widths), len(half_widths)):
@@ -46,7 +42,7 @@ def _direction(image: Image, x: int, y: int, half_widths: Ints) -> tuple[float, 
 
 
 @device
-def _rotate(points: Points, cosine: np.float32, sine: np.float32, stride: np.int32, offsets: NDArray[np.int32]) -> None:
+def _rotate(points: Floats32, cosine: np.float32, sine: np.float32, stride: np.int32, offsets: Ints32) -> None:
     """Write the memory offsets of the pixels nearest to rotated points."""
     for i in range(offsets.size):
         x, y = points[0, i], points[1, i]
@@ -57,7 +53,7 @@ def _rotate(points: Points, cosine: np.float32, sine: np.float32, stride: np.int
 
 
 @kernel("(u1[:,::1], u1[:,::1], i8[:,::1], f4[:,::1], i8[::1])")
-def describe(image: Image, smoothed: Image, corners: Ints, points: Points, half_widths: Ints) -> Image:
+def describe(image: Bytes, smoothed: Bytes, corners: Ints, points: Floats32, half_widths: Ints) -> Bytes:
     """Oriented BRIEF descriptors.
 
     Args:

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats, Ints
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
-from v3d_torch.kernels.reprojection import Array, huber, multiply, perspective_jacobian, se3_exp, transform
+from v3d_torch.kernels.reprojection import huber, multiply, perspective_jacobian, se3_exp, transform
 from v3d_torch.kernels.schur import solve_normal_equations
-
-Index = NDArray[np.int64]
 
 
 @device
 def _compute_residuals(
-    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, influence: Array, pose: Index,
-    first: Index, min_depth: float, r: Array, weights: Array, chi2: Array,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, influence: Floats, pose: Ints,
+    first: Ints, min_depth: float, r: Floats, weights: Floats, chi2: Floats,
 ) -> float:  # fmt: skip
     """Return the robust cost; write the whitened residuals, their weights, and the squared errors."""
     cost = 0.0
@@ -36,8 +34,8 @@ def _compute_residuals(
 
 @device
 def _linearise(
-    T_cw: Array, points: Array, scale: Array, pose: Index, first: Index, row: Index, min_depth: float,
-    r: Array, weights: Array, U: Array, V: Array, W: Array,
+    T_cw: Floats, points: Floats, scale: Floats, pose: Ints, first: Ints, row: Ints, min_depth: float,
+    r: Floats, weights: Floats, U: Floats, V: Floats, W: Floats,
 ) -> None:  # fmt: skip
     """Write the blocks of the normal equations; the last columns of U and V are gradients, W is for free poses only."""
     U[:], V[:] = 0.0, 0.0
@@ -70,7 +68,7 @@ def _linearise(
 
 
 @device
-def _find_rows(pose: Index, free: Index, count: int) -> Index:
+def _find_rows(pose: Ints, free: Ints, count: int) -> Ints:
     """Index of each observation's pose among the free poses; -1 for fixed poses."""
     row = np.full(count, -1, np.int64)
     row[free] = np.arange(len(free))
@@ -82,10 +80,10 @@ def _find_rows(pose: Index, free: Index, count: int) -> Index:
     " UniTuple(f8, 4))"
 )
 def bundle_adjust(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, influence: Array, pose: Index,
-    first: Index, free: Index, iterations: int, tolerance: float, regularisation: float, min_depth: float,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, influence: Floats, pose: Ints,
+    first: Ints, free: Ints, iterations: int, tolerance: float, regularisation: float, min_depth: float,
     damping_schedule: DampingSchedule,
-) -> tuple[Array, Array, Array, float, float, int]:  # fmt: skip
+) -> tuple[Floats, Floats, Floats, float, float, int]:  # fmt: skip
     """Optimise poses and points by Levenberg-Marquardt.
 
     Args:
@@ -140,8 +138,8 @@ def bundle_adjust(
     "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)"
 )
 def reduced_cost_derivatives(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, influence: Array, pose: Index,
-    first: Index, free: Index, j: Array, damping: float, regularisation: float, min_depth: float,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, influence: Floats, pose: Ints,
+    first: Ints, free: Ints, j: Floats, damping: float, regularisation: float, min_depth: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats, Ints, SignedBytes
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.reprojection import Array
-from v3d_torch.kernels.voxel_blocks import BITS, UNKNOWN, Ints, local_index
+from v3d_torch.kernels.voxel_blocks import BITS, UNKNOWN, local_index
 
 
 @device
@@ -32,7 +31,7 @@ def _squared_gap(point: float, voxel: int, size: float) -> float:
 
 @device
 def _is_ball_free(
-    point: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
+    point: Floats, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: SignedBytes
 ) -> bool:
     """Check whether all voxels that a ball touches are free."""
     reach = math.ceil(radius / size)
@@ -58,8 +57,8 @@ def _is_ball_free(
 
 @kernel("(f8[:,::1], f8, f8, i8[::1], i8[::1], i8, i1[:,::1])")
 def are_balls_free(
-    points: Array, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: NDArray[np.int8]
-) -> NDArray[np.bool_]:
+    points: Floats, radius: float, size: float, keys: Ints, rows: Ints, bound: int, log_odds: SignedBytes
+) -> Bools:
     """Check whether balls lie in free space.
 
     Args:

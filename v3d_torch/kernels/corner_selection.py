@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Ints
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.radix_sort import Ints, argsort
+from v3d_torch.kernels.radix_sort import argsort
 
 
 @device
-def _divide_fullest(sizes: Ints, gains: Ints, missing: int) -> NDArray[np.bool_]:
+def _divide_fullest(sizes: Ints, gains: Ints, missing: int) -> Bools:
     """Choose the cells to divide, those with the most corners first, until the wanted number is reached."""
     divided, gained = np.zeros(len(sizes), np.bool_), 0
     largest = sizes.max()
@@ -22,7 +22,7 @@ def _divide_fullest(sizes: Ints, gains: Ints, missing: int) -> NDArray[np.bool_]
 
 
 @device
-def _choose_cells(begins: Ints, depth: int, count: int) -> NDArray[np.bool_]:
+def _choose_cells(begins: Ints, depth: int, count: int) -> Bools:
     """Choose the cells of one image: True for the first corner of each.
 
     Args:

@@ -10,13 +10,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats, Ints
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.radix_sort import Ints, argsort
-
-Points = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from v3d_torch.kernels.radix_sort import argsort
 
 MAX_CELLS = 2.0**20
 """Upper bound of the bounding box along each axis, cells. Rounding errors are then far smaller than `_MARGIN`."""
@@ -26,7 +23,7 @@ _MARGIN = 1e-9
 
 
 @device
-def _is_near(points: Points, i: int, j: int, squared_radius: float) -> bool:
+def _is_near(points: Floats, i: int, j: int, squared_radius: float) -> bool:
     x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
     return x * x + y * y + z * z <= squared_radius
 
@@ -59,7 +56,7 @@ def _neighbouring_cells(keys: Ints, side_y: int, side_z: int) -> Ints:
 
 
 @device
-def _find_core_points(points: Points, begins: Ints, pairs: Ints, squared_radius: float, min_samples: int) -> Mask:
+def _find_core_points(points: Floats, begins: Ints, pairs: Ints, squared_radius: float, min_samples: int) -> Bools:
     """Mask of the core points, shape (N,). Neighbours of a point are counted until it is known to be a core point."""
     sizes = begins[1:] - begins[:-1]
     neighbours = np.repeat(sizes, sizes)
@@ -75,7 +72,7 @@ def _find_core_points(points: Points, begins: Ints, pairs: Ints, squared_radius:
 
 
 @device
-def _join_cells(points: Points, begins: Ints, pairs: Ints, squared_radius: float, core: Mask) -> Ints:
+def _join_cells(points: Floats, begins: Ints, pairs: Ints, squared_radius: float, core: Bools) -> Ints:
     """Parent of each cell, shape (C,), in a forest with one tree for each cluster."""
     parents = np.arange(len(begins) - 1)
     for a, b in pairs:
@@ -92,7 +89,7 @@ def _join_cells(points: Points, begins: Ints, pairs: Ints, squared_radius: float
 
 
 @kernel("(f8[:,::1], f8, i8)")
-def dbscan(points: Points, eps: float, min_samples: int) -> Ints:
+def dbscan(points: Floats, eps: float, min_samples: int) -> Ints:
     """Cluster of each point of one cloud, (N,); -1 for noise.
 
     Args:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats32
 from v3d_torch.kernels.compiler import device, kernel
-
-Image = NDArray[np.float32]
 
 
 @device
 def _accumulate(
-    z: Image, max_difference: Image, z_neighbour: Image, total: Image, weight: Image, tap: np.float32,
-    sums: Image, weights: Image,
+    z: Floats32, max_difference: Floats32, z_neighbour: Floats32, total: Floats32, weight: Floats32, tap: np.float32,
+    sums: Floats32, weights: Floats32,
 ) -> None:  # fmt: skip
     """Add the weighted depth differences of one neighbour of each pixel of a row; all arrays have shape (W,).
 
@@ -30,7 +28,9 @@ def _accumulate(
 
 
 @kernel("(f4[:,::1], f4[::1], f4, f4, f4[:,::1])")
-def smooth_depth(depth: Image, taps: Image, edge_ratio: np.float32, max_depth: np.float32, smoothed: Image) -> None:
+def smooth_depth(
+    depth: Floats32, taps: Floats32, edge_ratio: np.float32, max_depth: np.float32, smoothed: Floats32
+) -> None:
     """Smooth a depth image in one sweep: rows first, then columns as soon as all rows of a window are summed.
 
     Args:

@@ -3,15 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Ints, Words
 from v3d_torch.kernels.compiler import device, kernel
-
-Words = NDArray[np.uint64]
-"""Descriptors as 64-bit words, (N, 4)."""
-Word = NDArray[np.uint64]
-"""One word of each descriptor, (N,)."""
-Indices = NDArray[np.int64]
 
 MAX_DISTANCE = 1 << 9
 """Exceeds the distance of any two descriptors, bits."""
@@ -46,7 +40,7 @@ def hamming_distance(a: Words, i: int, b: Words, j: int) -> int:
 
 
 @device
-def _measure_distances(a: Words, i: int, columns: tuple[Word, ...], distances: Indices) -> None:
+def _measure_distances(a: Words, i: int, columns: tuple[Words, ...], distances: Ints) -> None:
     """Write the distances between descriptor ``a[i]`` and all descriptors whose words are given in columns.
 
     The compiler vectorises this loop; a loop with conditions would take longer.
@@ -62,7 +56,7 @@ def _measure_distances(a: Words, i: int, columns: tuple[Word, ...], distances: I
 
 
 @device
-def _minimum(distances: Indices) -> int:
+def _minimum(distances: Ints) -> int:
     """Smallest distance, of at least one."""
     least = distances[0]
     for j in range(distances.size):
@@ -71,7 +65,7 @@ def _minimum(distances: Indices) -> int:
 
 
 @device
-def _first_of(distances: Indices, distance: int) -> int:
+def _first_of(distances: Ints, distance: int) -> int:
     """Position of the first descriptor at a distance; there is one."""
     position = 0
     while distances[position] != distance:
@@ -80,7 +74,7 @@ def _first_of(distances: Indices, distance: int) -> int:
 
 
 @kernel("(u8[:,::1], u8[:,::1], i8, f8)")
-def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) -> Indices:
+def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) -> Ints:
     """Pairs of mutual nearest neighbours that pass the ratio test, sorted by the row of ``a``, (K, 2).
 
     Args:

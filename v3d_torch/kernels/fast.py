@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bytes, Floats, Ints
 from v3d_torch.kernels.compiler import device, kernel
-
-Image = NDArray[np.uint8]
-Ints = NDArray[np.int64]
 
 RADIUS = 3
 """Radius of the circle around a corner, pixels."""
@@ -34,7 +31,7 @@ def _brightest_arc(circle: tuple[np.uint8, ...]) -> np.uint8:
 
 
 @device
-def _add_bright_arcs(rows: tuple[Image, ...], strength: Image) -> None:
+def _add_bright_arcs(rows: tuple[Bytes, ...], strength: Bytes) -> None:
     """Raise the strength of each pixel of a row to the difference between its brightest arc and the pixel.
 
     The compiler vectorises this loop; a loop with conditions would take longer.
@@ -54,7 +51,7 @@ def _add_bright_arcs(rows: tuple[Image, ...], strength: Image) -> None:
 
 
 @device
-def _measure_strength(image: Image, y: int, left: int, right: int, strength: Image) -> None:
+def _measure_strength(image: Bytes, y: int, left: int, right: int, strength: Bytes) -> None:
     """Raise the strength of the pixels of row ``y`` from column ``left`` to ``right``, see `_add_bright_arcs`."""
     columns = slice(left - RADIUS, right + RADIUS)
     rows = (
@@ -65,7 +62,7 @@ def _measure_strength(image: Image, y: int, left: int, right: int, strength: Ima
 
 
 @device
-def _keep_maxima(above: Image, row: Image, below: Image, limit: Image, maxima: Image) -> None:
+def _keep_maxima(above: Bytes, row: Bytes, below: Bytes, limit: Bytes, maxima: Bytes) -> None:
     """Copy the strength of local maxima above a limit, and write 0 for other pixels.
 
     Of equal neighbours, the first is the maximum. The rows have a margin of one pixel on both sides, (W + 2,).
@@ -78,7 +75,7 @@ def _keep_maxima(above: Image, row: Image, below: Image, limit: Image, maxima: I
 
 
 @device
-def _raise(row: Image, maximum: Image) -> None:
+def _raise(row: Bytes, maximum: Bytes) -> None:
     """Update a maximum in place."""
     for x in range(maximum.size):
         maximum[x] = max(maximum[x], row[x])
@@ -93,8 +90,8 @@ def _peak_offset(before: np.uint8, centre: np.uint8, after: np.uint8) -> float:
 
 @kernel("(u1[:,::1], i8[:,::1], i8, i8, i8)")
 def detect_corners(
-    image: Image, boxes: Ints, threshold: int, min_threshold: int, cell: int
-) -> tuple[Ints, Ints, NDArray[np.float64]]:
+    image: Bytes, boxes: Ints, threshold: int, min_threshold: int, cell: int
+) -> tuple[Ints, Ints, Floats]:
     """Detect corners: strong ones, and weak ones in cells without a strong one.
 
     Args:

@@ -5,27 +5,25 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats, Floats32
 from v3d_torch.kernels.camera import Bounds, Intrinsics, distort, is_in_image
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.reprojection import Array, transform
-
-Depth = NDArray[np.float32]
+from v3d_torch.kernels.reprojection import transform
 
 Limits = tuple[float, float, float, float]
 """Minimum and maximum depth of a point, metres; tolerance divided by the squared depth, 1/m; minimum tolerance, m."""
 
 
 @device
-def _to_pixels(points: Array, intrinsics: Intrinsics, pixels: Array) -> None:
+def _to_pixels(points: Floats, intrinsics: Intrinsics, pixels: Floats) -> None:
     for i in range(points.shape[1]):
         pixels[0, i], pixels[1, i] = distort(points[0, i], points[1, i], intrinsics)
 
 
 @device
 def _compare(
-    points: Array, nearest_depth: Depth, intrinsics: Intrinsics, bounds: Bounds, limits: Limits, free: Array
+    points: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds, limits: Limits, free: Floats
 ) -> None:
     """Compare points (x / z, y / z, z), (3, N), with a view: 1 in free space, 0 on a surface, NaN if unknown, (N,)."""
     min_depth, _, relative_tolerance, min_tolerance = limits
@@ -44,8 +42,8 @@ def _compare(
 
 @kernel("(f8[:,:], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4))")
 def is_free_space(
-    points: Array, T_cw: Array, nearest_depth: Depth, intrinsics: Intrinsics, bounds: Bounds, limits: Limits
-) -> Array:
+    points: Floats, T_cw: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds, limits: Limits
+) -> Floats:
     """Check whether points lie in space that a view observes as free.
 
     Args:
@@ -69,7 +67,7 @@ def is_free_space(
 
 @device
 def _transform_row(
-    depth: Depth, stride: int, rays: Array, T_wc: Array, T_cw: Array, limits: Limits, in_view: Array
+    depth: Floats32, stride: int, rays: Floats, T_wc: Floats, T_cw: Floats, limits: Limits, in_view: Floats
 ) -> None:
     """Transform every n-th point of a row from one view to another, (x / z, y / z, z); z is NaN without depth."""
     min_depth, max_depth, _, _ = limits
@@ -86,8 +84,8 @@ def _transform_row(
     " f8[:,::1])"
 )
 def newly_occupied(
-    depth: Depth, stride: int, rays: Array, T_wc: Array, T_cw: Array, nearest_depth: Depth, intrinsics: Intrinsics,
-    bounds: Bounds, limits: Limits, appeared: Array,
+    depth: Floats32, stride: int, rays: Floats, T_wc: Floats, T_cw: Floats, nearest_depth: Floats32,
+    intrinsics: Intrinsics, bounds: Bounds, limits: Limits, appeared: Floats,
 ) -> None:  # fmt: skip
     """Check whether the points of every n-th pixel lie in space that an earlier view observed as free.
 

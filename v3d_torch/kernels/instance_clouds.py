@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats32, Ints
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.dbscan import dbscan
-from v3d_torch.kernels.radix_sort import Ints
-from v3d_torch.kernels.voxel import Points, pool_voxels
-
-Depth = NDArray[np.float32]
-Mask = NDArray[np.bool_]
+from v3d_torch.kernels.voxel import pool_voxels
 
 
 @device
-def _select_largest(labels: Ints) -> Mask:
+def _select_largest(labels: Ints) -> Bools:
     """Mask of the points of the largest cluster, shape (N,); of equal clusters, the one with the lower label."""
     sizes = np.zeros(len(labels) + 1, np.int64)
     for label in labels:
@@ -25,9 +21,9 @@ def _select_largest(labels: Ints) -> Mask:
 
 @kernel("(f4[:,::1], b1[:,::1], f4[:,::1], i8, f4, f4, f8, i8, b1[:,::1])")
 def instance_cloud(
-    depth: Depth, mask: Mask, rays: Points, stride: int, max_depth: np.float32, voxel_size: np.float32, eps: float,
-    min_samples: int, cloud_pixels: Mask,
-) -> tuple[Points, Mask]:  # fmt: skip
+    depth: Floats32, mask: Bools, rays: Floats32, stride: int, max_depth: np.float32, voxel_size: np.float32,
+    eps: float, min_samples: int, cloud_pixels: Bools,
+) -> tuple[Floats32, Bools]:  # fmt: skip
     """Back-project one instance, pool its points, and select the largest cluster.
 
     Args:

@@ -5,20 +5,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats, Ints
 from v3d_torch.kernels.compiler import kernel
 from v3d_torch.kernels.reprojection import transform
-
-Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 
 @kernel("(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8, i8, i8)")
 def project(
-    T_cw: Array, points: Array, directions: Array, reference_distance: Array, K: Array, bounds: Array,
+    T_cw: Floats, points: Floats, directions: Floats, reference_distance: Floats, K: Floats, bounds: Floats,
     log_scale: float, first_octave: int, last_octave: int,
-) -> tuple[Indices, Array, Array, Indices]:  # fmt: skip
+) -> tuple[Ints, Floats, Floats, Ints]:  # fmt: skip
     """Project landmarks into a camera, and select the V landmarks in view.
 
     Args:

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats32, Ints
 from v3d_torch.kernels.compiler import kernel
-
-Array = NDArray[np.float32]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @kernel("(f4[:,:,::1], i8[:,::1], UniTuple(i8, 2), i8[::1], f4[:,::1], i8[::1], f4[:,::1], b1[:,:,::1])")
 def upsample_masks(
-    logits: Array, boxes: Indices, first: tuple[int, int], row_cells: Indices, row_weights: Array,
-    column_starts: Indices, column_weights: Array, masks: Mask,
+    logits: Floats32, boxes: Ints, first: tuple[int, int], row_cells: Ints, row_weights: Floats32,
+    column_starts: Ints, column_weights: Floats32, masks: Bools,
 ) -> None:  # fmt: skip
     """Write the pixels with positive logits inside the boxes, by bilinear interpolation between cells.
 

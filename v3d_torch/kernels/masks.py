@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bytes, Ints32
 from v3d_torch.kernels.compiler import device, kernel
-
-Mask = NDArray[np.uint8]
 
 
 @device
-def _count_on(previous: Mask, mask: Mask, farthest: np.uint8, distance: Mask) -> None:
+def _count_on(previous: Bytes, mask: Bytes, farthest: np.uint8, distance: Bytes) -> None:
     for x in range(distance.size):
         farther = np.uint8(previous[x] + np.uint8(1))
         distance[x] = np.uint8(0) if mask[x] else farther if farther < farthest else farthest
 
 
 @device
-def _lower(following: Mask, distance: Mask) -> None:
+def _lower(following: Bytes, distance: Bytes) -> None:
     for x in range(distance.size):
         distance[x] = min(np.uint8(following[x] + np.uint8(1)), distance[x])
 
 
 @device
-def _add_near(distance: Mask, height: int, dilated: Mask) -> None:
+def _add_near(distance: Bytes, height: int, dilated: Bytes) -> None:
     for x in range(dilated.size):
         dilated[x] |= np.uint8(distance[x] <= height)
 
 
 @kernel("(u1[:,::1], u1[::1])")
-def dilate(mask: Mask, heights: Mask) -> Mask:
+def dilate(mask: Bytes, heights: Bytes) -> Bytes:
     """Dilate a mask by a convex, symmetric shape.
 
     Args:
@@ -60,15 +58,15 @@ def dilate(mask: Mask, heights: Mask) -> Mask:
 
 
 @device
-def _intersect(a: Mask, b: Mask, both: Mask) -> None:
+def _intersect(a: Bytes, b: Bytes, both: Bytes) -> None:
     for x in range(both.size):
         both[x] = a[x] & b[x]
 
 
 @kernel("(i4[:,::1], i8, u1[:,::1], u1[:,::1], i8, f8)")
 def fill_components(
-    components: NDArray[np.int32], count: int, seeds: Mask, reachable: Mask, stride: int, min_fraction: float
-) -> Mask:
+    components: Ints32, count: int, seeds: Bytes, reachable: Bytes, stride: int, min_fraction: float
+) -> Bytes:
     """Select the reachable pixels of the components with enough seeds, and of their neighbour cells.
 
     Args:

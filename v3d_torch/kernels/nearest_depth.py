@@ -3,44 +3,42 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats32
 from v3d_torch.kernels.compiler import device, kernel
-
-Depth = NDArray[np.float32]
 
 _MAX = np.finfo(np.float32).max
 """Depth of pixels without measurement: larger than any measured depth."""
 
 
 @device
-def _read(depth: Depth, row: Depth) -> None:
+def _read(depth: Floats32, row: Floats32) -> None:
     """Copy a row; pixels without depth are set to the largest number."""
     for x in range(row.size):
         row[x] = depth[x] if depth[x] > 0 else np.float32(_MAX)
 
 
 @device
-def _min(a: Depth, b: Depth, minimum: Depth) -> None:
+def _min(a: Floats32, b: Floats32, minimum: Floats32) -> None:
     for x in range(minimum.size):
         minimum[x] = a[x] if a[x] < b[x] else b[x]
 
 
 @device
-def _lower(a: Depth, minimum: Depth) -> None:
+def _lower(a: Floats32, minimum: Floats32) -> None:
     """Update a minimum in place; in one loop with `_min`, arrays could overlap and would not be vectorised."""
     for x in range(minimum.size):
         minimum[x] = a[x] if a[x] < minimum[x] else minimum[x]
 
 
 @device
-def _write(a: Depth, b: Depth, depth: Depth, nearest: Depth) -> None:
+def _write(a: Floats32, b: Floats32, depth: Floats32, nearest: Floats32) -> None:
     for x in range(nearest.size):
         nearest[x] = (a[x] if a[x] < b[x] else b[x]) if depth[x] > 0 else np.float32(0)
 
 
 @kernel("(f4[:,::1], i8)")
-def nearest_depth(depth: Depth, radius: int) -> Depth:
+def nearest_depth(depth: Floats32, radius: int) -> Floats32:
     """Minimum depth in a square around each pixel (van Herk's algorithm along columns).
 
     Args:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats32
 from v3d_torch.kernels.compiler import device, kernel
-
-Array = NDArray[np.float32]
 
 
 @device
-def _multiply_differences(points: Array, edge_ratio: np.float32, products: Array, valid: NDArray[np.bool_]) -> None:
+def _multiply_differences(points: Floats32, edge_ratio: np.float32, products: Floats32, valid: Bools) -> None:
     """Write the cross product of the differences of each pixel's neighbours, if all lie on one surface.
 
     Args:
@@ -38,7 +36,7 @@ def _multiply_differences(points: Array, edge_ratio: np.float32, products: Array
 
 
 @device
-def _add_neighbours(z: Array, limit: Array, z_neighbour: Array, product: Array, total: Array) -> None:
+def _add_neighbours(z: Floats32, limit: Floats32, z_neighbour: Floats32, product: Floats32, total: Floats32) -> None:
     """Add one coordinate of the neighbours' products to a row, where the neighbour lies on the same surface.
 
     The compiler vectorises this loop; all arrays have shape (W,).
@@ -48,7 +46,7 @@ def _add_neighbours(z: Array, limit: Array, z_neighbour: Array, product: Array, 
 
 
 @kernel("(f4[:,:,::1], i8, f4, f4, f4[:,:,::1])")
-def surface_normals(points: Array, radius: int, edge_ratio: np.float32, eps: np.float32, normals: Array) -> None:
+def surface_normals(points: Floats32, radius: int, edge_ratio: np.float32, eps: np.float32, normals: Floats32) -> None:
     """Average the cross products of neighbour differences over a window around each pixel, and normalise.
 
     Args:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bytes
 from v3d_torch.kernels.compiler import device, kernel
-
-Bytes = NDArray[np.uint8]
 
 
 @kernel("(u1[:,::1], i8, u1[:,::1])")

@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from v3d_torch.kernels import se3
-from v3d_torch.kernels.block_cholesky import Index, Mask, factorise, find_block, order_by_degree, solve_factorised
+from v3d_torch.kernels.arrays import Bools, Floats, Ints
+from v3d_torch.kernels.block_cholesky import factorise, find_block, order_by_degree, solve_factorised
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
-from v3d_torch.kernels.reprojection import Array, huber, multiply, se3_exp
+from v3d_torch.kernels.reprojection import huber, multiply, se3_exp
 
 
 @device
 def _linearise(
-    T_wc: Array, edges: Index, T_ji: Array, information: Array, weights: Array, limit: float, place: Index,
-    slots: Index, blocks: Array, g: Array,
+    T_wc: Floats, edges: Ints, T_ji: Floats, information: Floats, weights: Floats, limit: float, place: Ints,
+    slots: Ints, blocks: Floats, g: Floats,
 ) -> float:  # fmt: skip
     """Return the robust cost; write the lower triangle of the normal equations and their right-hand sides."""
     blocks[:], g[:], cost = 0.0, 0.0, 0.0
@@ -51,9 +52,9 @@ def _linearise(
 
 @kernel("(f8[:,:,::1], i8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[::1], b1[::1], f8, i8, f8, f8, UniTuple(f8, 4))")
 def optimise_pose_graph(
-    T_wc: Array, edges: Index, T_ji: Array, information: Array, weights: Array, fixed: Mask, limit: float,
+    T_wc: Floats, edges: Ints, T_ji: Floats, information: Floats, weights: Floats, fixed: Bools, limit: float,
     iterations: int, tolerance: float, regularisation: float, damping_schedule: DampingSchedule,
-) -> tuple[Array, float, float, int, bool]:  # fmt: skip
+) -> tuple[Floats, float, float, int, bool]:  # fmt: skip
     """Optimise the free poses of a graph by Levenberg-Marquardt.
 
     Args:

@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
-from v3d_torch.kernels.reprojection import (
-    Array,
-    huber,
-    multiply,
-    perspective_jacobian,
-    se3_exp,
-    solve_symmetric,
-    transform,
-)
-
-Mask = NDArray[np.bool_]
+from v3d_torch.kernels.reprojection import huber, multiply, perspective_jacobian, se3_exp, solve_symmetric, transform
 
 
 @device
 def _linearise(
-    T_cw: Array, points: Array, scale: Array, offset: Array, thresholds: Array, influence: Array, active: Mask,
-    min_depth: float, H: Array, g: Array, chi2: Array,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, influence: Floats, active: Bools,
+    min_depth: float, H: Floats, g: Floats, chi2: Floats,
 ) -> float:  # fmt: skip
     """Return the robust cost of the active measurements; write the normal equations and all squared errors."""
     H[:], g[:] = 0.0, 0.0
@@ -55,10 +45,10 @@ def _linearise(
 
 @device
 def _refine(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, weights: Floats, valid: Bools,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
-    damping_schedule: DampingSchedule, inliers: Mask, active: Mask,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    damping_schedule: DampingSchedule, inliers: Bools, active: Bools,
+) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Refine one pose; write the masks, and return pose, squared residuals and information matrix."""
     count = len(points)
     inliers[:], active[:], thresholds = valid, valid, chi2_thresholds.copy()
@@ -103,10 +93,10 @@ def _refine(
     " UniTuple(f8, 4))"
 )
 def refine_poses(
-    T_cw: Array, points: Array, scale: Array, offset: Array, chi2_thresholds: Array, weights: Array, valid: Mask,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, weights: Floats, valid: Bools,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
     damping_schedule: DampingSchedule,
-) -> tuple[Array, Mask, Mask, Array, Array]:  # fmt: skip
+) -> tuple[Floats, Bools, Bools, Floats, Floats]:  # fmt: skip
     """Refine B poses in rounds of Levenberg-Marquardt, each with N measurements.
 
     Args:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats, Ints, Words
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.descriptors import MAX_DISTANCE, Indices, Words, hamming_distance
-
-Array = NDArray[np.float64]
+from v3d_torch.kernels.descriptors import MAX_DISTANCE, hamming_distance
 
 
 @device
-def _sort_by_cell(column: Indices, row: Indices, width: int, height: int) -> tuple[Indices, Indices]:
+def _sort_by_cell(column: Ints, row: Ints, width: int, height: int) -> tuple[Ints, Ints]:
     """Order of features by the cells of a grid, row by row, and the first position of each cell in this order."""
     begin = np.zeros(width * height + 1, np.int64)
     for i in range(len(column)):
@@ -30,9 +28,9 @@ def _sort_by_cell(column: Indices, row: Indices, width: int, height: int) -> tup
 
 @kernel("(f8[:,::1], f8[::1], i8[::1], u8[:,::1], f8[:,::1], i8[::1], u8[:,::1], i8, f8, f8)")
 def match_by_projection(
-    projected: Array, radius: Array, landmark_octave: Indices, landmark_descriptors: Words, uv: Array, octave: Indices,
+    projected: Floats, radius: Floats, landmark_octave: Ints, landmark_descriptors: Words, uv: Floats, octave: Ints,
     descriptors: Words, max_hamming: int, max_ratio: float, cell: float,
-) -> Indices:  # fmt: skip
+) -> Ints:  # fmt: skip
     """Pairs (landmark, feature) with similar descriptors near the landmark's projection, sorted by landmark, (K, 2).
 
     Args:

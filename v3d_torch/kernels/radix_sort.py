@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Ints
 from v3d_torch.kernels.compiler import device
-
-Ints = NDArray[np.int64]
 
 _DIGIT = 11
 """Number of bits of a digit: the counts of all values of a digit fit into the processor's first-level cache."""

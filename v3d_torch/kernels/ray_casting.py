@@ -5,19 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Bytes, Floats, Floats32, Ints, Ints32
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.reprojection import Array
-from v3d_torch.kernels.voxel_blocks import BITS, FREE, HIT, VOLUME, Ints, Marks, local_index
-
-Depth = NDArray[np.float32]
-
-Table = NDArray[np.int32]
+from v3d_torch.kernels.voxel_blocks import BITS, FREE, HIT, VOLUME, local_index
 
 
 @device
-def _nearest_depth(depth: Depth, row: int, column: int) -> float:
+def _nearest_depth(depth: Floats32, row: int, column: int) -> float:
     """Minimum depth of a sample and its eight neighbours, metres; samples without depth do not count."""
     height, width = depth.shape
     nearest = math.inf
@@ -40,7 +35,7 @@ def _enter(origin: float, direction: float) -> tuple[int, int, float, float]:
 
 
 @device
-def _block_row(x: int, y: int, z: int, first: Ints, table: Table, blocks: Ints, count: int) -> tuple[int, int]:
+def _block_row(x: int, y: int, z: int, first: Ints, table: Ints32, blocks: Ints, count: int) -> tuple[int, int]:
     """Row of the block that contains a voxel, and number of rows; a new block gets the row ``count``."""
     x, y, z = x >> BITS, y >> BITS, z >> BITS
     i, j, k = x - first[0], y - first[1], z - first[2]
@@ -54,8 +49,8 @@ def _block_row(x: int, y: int, z: int, first: Ints, table: Table, blocks: Ints, 
 
 @device
 def _cast_ray(
-    origin: Array, direction: Array, free_depth: float, hit_depth: float, first: Ints, table: Table, blocks: Ints,
-    marks: Marks, count: int,
+    origin: Floats, direction: Floats, free_depth: float, hit_depth: float, first: Ints, table: Ints32, blocks: Ints,
+    marks: Bytes, count: int,
 ) -> int:  # fmt: skip
     """Mark the voxels along a ray as free, and the voxel of the surface as hit; return the number of blocks."""
     x, step_x, exit_x, depth_x = _enter(origin[0], direction[0])
@@ -87,9 +82,9 @@ def _cast_ray(
 
 @kernel("(f4[:,::1], b1[:,::1], f4[:,:,::1], f8[:,::1], f8, f8, f8, i8)")
 def observe_voxels(
-    depth: Depth, static: NDArray[np.bool_], rays: Depth, T_wc: Array, voxel_size: float, max_depth: float,
+    depth: Floats32, static: Bools, rays: Floats32, T_wc: Floats, voxel_size: float, max_depth: float,
     tolerance: float, reach: int,
-) -> tuple[Ints, Marks]:  # fmt: skip
+) -> tuple[Ints, Bytes]:  # fmt: skip
     """Find the voxels that a view observes as free or hits.
 
     Args:

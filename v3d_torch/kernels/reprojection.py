@@ -8,18 +8,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats
 from v3d_torch.kernels.compiler import device
-
-Array = NDArray[np.float64]
 
 SMALL_ANGLE = 1e-4
 """Rotation angle in radians below which the limits of the closed forms are exact to float64."""
 
 
 @device
-def transform(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+def transform(T: Floats, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Apply a rigid motion, shape (4, 4), to a point."""
     return (
         T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
@@ -36,7 +34,7 @@ def huber(squared: float, threshold: float) -> tuple[float, float]:
 
 
 @device
-def perspective_jacobian(a: float, b: float, w: float, J: Array) -> None:
+def perspective_jacobian(a: float, b: float, w: float, J: Floats) -> None:
     """Write the derivatives of (a, b, w) = (x/z, y/z, 1/z) by the left perturbation of the pose to ``J``, (3, 6)."""
     J[0, 0], J[0, 1], J[0, 2], J[0, 3], J[0, 4], J[0, 5] = w, 0.0, -w * a, -b * a, a * a + 1, -b
     J[1, 0], J[1, 1], J[1, 2], J[1, 3], J[1, 4], J[1, 5] = 0.0, w, -w * b, -b * b - 1, a * b, a
@@ -44,7 +42,7 @@ def perspective_jacobian(a: float, b: float, w: float, J: Array) -> None:
 
 
 @device
-def se3_exp(xi: Array) -> Array:
+def se3_exp(xi: Floats) -> Floats:
     """Rigid motion, shape (4, 4), of a tangent vector ``[translation, rotation]``."""
     X = np.zeros((4, 4))
     X[0, 3], X[1, 3], X[2, 3] = xi[0], xi[1], xi[2]
@@ -58,7 +56,7 @@ def se3_exp(xi: Array) -> Array:
 
 
 @device
-def multiply(A: Array, B: Array) -> Array:
+def multiply(A: Floats, B: Floats) -> Floats:
     """Product of two matrices; for small matrices a loop is faster than BLAS."""
     C = np.zeros((A.shape[0], B.shape[1]))
     for i in range(A.shape[0]):
@@ -69,7 +67,7 @@ def multiply(A: Array, B: Array) -> Array:
 
 
 @device
-def solve_symmetric(A: Array, b: Array) -> Array:
+def solve_symmetric(A: Floats, b: Floats) -> Floats:
     """Solve ``A x = b`` for a symmetric positive definite matrix, by the decomposition ``L D L^T``."""
     n = len(b)
     L, x = np.zeros((n, n)), b.copy()

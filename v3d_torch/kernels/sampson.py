@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.levenberg_marquardt import DampingSchedule, has_converged, next_damping
-from v3d_torch.kernels.reprojection import Array, multiply, se3_exp, solve_symmetric
-
-Mask = NDArray[np.bool_]
+from v3d_torch.kernels.reprojection import multiply, se3_exp, solve_symmetric
 
 _MIN_SQUARE = 1e-30
 """Smallest squared denominator of a Sampson distance."""
 
 
 @device
-def _fundamental(U: Array, V: Array, K_inverse: Array) -> Array:
+def _fundamental(U: Floats, V: Floats, K_inverse: Floats) -> Floats:
     """Fundamental matrix of the rotations U and V."""
     E = np.empty((3, 3))
     for i in range(3):
@@ -28,7 +26,7 @@ def _fundamental(U: Array, V: Array, K_inverse: Array) -> Array:
 
 
 @device
-def _tangents(U: Array, V: Array, K_inverse: Array) -> Array:
+def _tangents(U: Floats, V: Floats, K_inverse: Floats) -> Floats:
     """Derivatives of the fundamental matrix by the five parameters of an update, (5, 3, 3)."""
     G, axes = np.empty((5, 3, 3)), np.zeros((5, 3))
     for i in range(3):
@@ -46,7 +44,7 @@ def _tangents(U: Array, V: Array, K_inverse: Array) -> Array:
 
 
 @device
-def _constraint(F: Array, a: Array, b: Array) -> tuple[float, float, float, float, float]:
+def _constraint(F: Floats, a: Floats, b: Floats) -> tuple[float, float, float, float, float]:
     """Product ``b^T F a``, and the first two elements of the epipolar lines in image b and in image a."""
     b0, b1, b2 = (F[0, 0] * a[0] + F[0, 1] * a[1] + F[0, 2] * a[2], F[1, 0] * a[0] + F[1, 1] * a[1] + F[1, 2] * a[2],
                   F[2, 0] * a[0] + F[2, 1] * a[1] + F[2, 2] * a[2])  # fmt: skip
@@ -62,7 +60,7 @@ def _length(a0: float, a1: float, b0: float, b1: float) -> float:
 
 @device
 def _linearise(
-    U: Array, V: Array, K_inverse: Array, a: Array, b: Array, weights: Array, active: Mask, H: Array, g: Array
+    U: Floats, V: Floats, K_inverse: Floats, a: Floats, b: Floats, weights: Floats, active: Bools, H: Floats, g: Floats
 ) -> float:
     """Return the cost of the active pairs; write the normal equations."""
     F, G, J, cost = _fundamental(U, V, K_inverse), _tangents(U, V, K_inverse), np.empty(5), 0.0
@@ -86,7 +84,7 @@ def _linearise(
 
 @device
 def _classify(
-    U: Array, V: Array, K_inverse: Array, a: Array, b: Array, valid: Mask, threshold: float, inliers: Mask
+    U: Floats, V: Floats, K_inverse: Floats, a: Floats, b: Floats, valid: Bools, threshold: float, inliers: Bools
 ) -> bool:
     """Write the mask of valid pairs within the threshold; return True if it did not change."""
     F, unchanged = _fundamental(U, V, K_inverse), True
@@ -100,7 +98,7 @@ def _classify(
 
 
 @device
-def _move(U: Array, V: Array, x: Array) -> tuple[Array, Array]:
+def _move(U: Floats, V: Floats, x: Floats) -> tuple[Floats, Floats]:
     """Rotate U about three axes, and V about its first two columns."""
     turn_U, turn_V = np.zeros(6), np.zeros(6)
     for i in range(3):
@@ -113,9 +111,9 @@ def _move(U: Array, V: Array, x: Array) -> tuple[Array, Array]:
     " UniTuple(f8, 4))"
 )
 def refine_essential(
-    U: Array, V: Array, K_inverse: Array, a: Array, b: Array, weights: Array, valid: Mask, threshold: float,
+    U: Floats, V: Floats, K_inverse: Floats, a: Floats, b: Floats, weights: Floats, valid: Bools, threshold: float,
     rounds: int, iterations: int, tolerance: float, regularisation: float, damping_schedule: DampingSchedule,
-) -> tuple[Array, Array, Mask, Mask]:  # fmt: skip
+) -> tuple[Floats, Floats, Bools, Bools]:  # fmt: skip
     """Refine B essential matrices in rounds of Levenberg-Marquardt, each with N pairs of pixels.
 
     Args:

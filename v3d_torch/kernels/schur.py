@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats, Ints
 from v3d_torch.kernels.compiler import device
-from v3d_torch.kernels.reprojection import Array, solve_symmetric
-
-Index = NDArray[np.int64]
+from v3d_torch.kernels.reprojection import solve_symmetric
 
 
 @device
 def solve_normal_equations(
-    U: Array, V: Array, W: Array, row: Index, first: Index, damping: float, regularisation: float
-) -> tuple[Array, Array]:
+    U: Floats, V: Floats, W: Floats, row: Ints, first: Ints, damping: float, regularisation: float
+) -> tuple[Floats, Floats]:
     """Solve damped normal equations of F poses, P points and M observations by the Schur complement.
 
     Args:
@@ -68,7 +66,7 @@ def solve_normal_equations(
 
 
 @device
-def _subtract_product(A: Array, B: Array, S: Array, row: int, column: int) -> None:
+def _subtract_product(A: Floats, B: Floats, S: Floats, row: int, column: int) -> None:
     """Subtract ``A^T B``, with (3, 6) matrices A and B, from the block of S that begins at a row and a column."""
     for i in range(6):
         a0, a1, a2 = A[0, i], A[1, i], A[2, i]
@@ -77,7 +75,7 @@ def _subtract_product(A: Array, B: Array, S: Array, row: int, column: int) -> No
 
 
 @device
-def _cholesky(V: Array, damping: float, regularisation: float, L: Array) -> None:
+def _cholesky(V: Floats, damping: float, regularisation: float, L: Floats) -> None:
     """Write the Cholesky factor of a damped (3, 3) block, the first columns of V, to L, with an inverted diagonal."""
     for i in range(3):
         for k in range(i + 1):
@@ -88,7 +86,7 @@ def _cholesky(V: Array, damping: float, regularisation: float, L: Array) -> None
 
 
 @device
-def _forward(L: Array, B: Array, X: Array) -> None:
+def _forward(L: Floats, B: Floats, X: Floats) -> None:
     """Solve ``L X = B`` with a factor of `_cholesky` and (3, n) matrices B and X."""
     for k in range(B.shape[1]):
         x = B[0, k] * L[0, 0]

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v3d_torch.kernels import reprojection
+from v3d_torch.kernels.arrays import Floats
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.reprojection import SMALL_ANGLE
-
-Array = NDArray[np.float64]
 
 _MAX_NEWTON_STEPS = 8
 """Maximum number of steps: rotations with rounding errors need two; other matrices are computed by the twin."""
@@ -24,7 +22,7 @@ SERIES_ANGLE_SQUARED = 1e-4
 
 
 @kernel("(f8[:,::1],)")
-def invert(T: Array) -> Array:
+def invert(T: Floats) -> Floats:
     """Inverse of a rigid motion, both (4, 4)."""
     inverse = np.eye(4)
     for i in range(3):
@@ -35,7 +33,7 @@ def invert(T: Array) -> Array:
 
 
 @device
-def _newton_step(R: Array) -> bool:
+def _newton_step(R: Floats) -> bool:
     """Replace a matrix, the first 3x3 elements, by the mean of it and its inverse transpose; check for convergence."""
     cofactors, converged = np.empty((3, 3)), True
     for i in range(3):
@@ -53,7 +51,7 @@ def _newton_step(R: Array) -> bool:
 
 
 @kernel("(f8[:,:,::1],)")
-def orthonormalise(T: Array) -> tuple[bool, Array]:
+def orthonormalise(T: Floats) -> tuple[bool, Floats]:
     """Replace the rotations of rigid motions, (B, 4, 4), by the nearest ones: polar decomposition by Newton's method.
 
     N. Higham, Computing the polar decomposition with applications, SIAM J. Sci. Stat. Comput., 1986.
@@ -74,13 +72,13 @@ def orthonormalise(T: Array) -> tuple[bool, Array]:
 
 
 @kernel("(f8[::1],)")
-def exp(xi: Array) -> Array:
+def exp(xi: Floats) -> Floats:
     """Exponential map of a tangent vector ``[translation, rotation]``, (6,), to a rigid motion, (4, 4)."""
     return reprojection.se3_exp(xi)
 
 
 @device
-def _quaternion(R: Array) -> Array:
+def _quaternion(R: Floats) -> Floats:
     """Unit quaternion (w, x, y, z) of a rotation, with w >= 0."""
     rows = np.empty((4, 4))  # 4 q q^T: each row is a multiple of q, and the longest has the smallest relative error
     rows[0, 0], rows[1, 1] = R[0, 0] + R[1, 1] + R[2, 2] + 1, R[0, 0] - R[1, 1] - R[2, 2] + 1
@@ -98,7 +96,7 @@ def _quaternion(R: Array) -> Array:
 
 
 @device
-def log(T: Array) -> Array:
+def log(T: Floats) -> Floats:
     """Logarithm of a rigid motion, (4, 4): the tangent vector ``[translation, rotation]``, (6,)."""
     q, small = _quaternion(T), SMALL_ANGLE**2
     square = q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
@@ -126,7 +124,7 @@ def log(T: Array) -> Array:
 
 
 @kernel("(f8[:,:,::1],)")
-def logarithms(T: Array) -> Array:
+def logarithms(T: Floats) -> Floats:
     """Logarithms of rigid motions, (B, 4, 4): the tangent vectors, (B, 6)."""
     result = np.empty((len(T), 6))
     for b in range(len(T)):
@@ -135,14 +133,14 @@ def logarithms(T: Array) -> Array:
 
 
 @device
-def _write_skew(x: float, y: float, z: float, matrix: Array, row: int, column: int) -> None:
+def _write_skew(x: float, y: float, z: float, matrix: Floats, row: int, column: int) -> None:
     """Write the matrix of the cross product with a vector to a block of a matrix of zeros."""
     matrix[row, column + 1], matrix[row, column + 2], matrix[row + 1, column + 2] = -z, y, -x
     matrix[row + 1, column], matrix[row + 2, column], matrix[row + 2, column + 1] = z, -y, x
 
 
 @device
-def right_jacobian_inverse(xi: Array) -> Array:
+def right_jacobian_inverse(xi: Floats) -> Floats:
     """Derivative of a logarithm by a perturbation on the right, (6, 6); see `left_jacobian_inverse` of ``-xi``."""
     A, J = np.zeros((6, 6)), np.eye(6)
     _write_skew(xi[3], xi[4], xi[5], A, 0, 0)
@@ -166,7 +164,7 @@ def right_jacobian_inverse(xi: Array) -> Array:
 
 
 @device
-def adjoint(T: Array) -> Array:
+def adjoint(T: Floats) -> Floats:
     """Adjoint of a rigid motion, (6, 6)."""
     A, skew = np.zeros((6, 6)), np.zeros((3, 3))
     _write_skew(T[0, 3], T[1, 3], T[2, 3], skew, 0, 0)

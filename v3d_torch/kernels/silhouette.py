@@ -5,21 +5,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bools, Floats, Floats32, Ints
 from v3d_torch.kernels.camera import Bounds, Intrinsics, project_to_image
 from v3d_torch.kernels.compiler import device, kernel
-from v3d_torch.kernels.reprojection import Array
-
-Depth = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Cells = NDArray[np.int64]
 
 
 @kernel("(f8[:,:], f8, i8, UniTuple(f8, 13), UniTuple(f8, 6))")
 def project_to_cells(
-    points: Array, min_depth: float, cell: int, intrinsics: Intrinsics, bounds: Bounds
-) -> tuple[Cells, Depth]:
+    points: Floats, min_depth: float, cell: int, intrinsics: Intrinsics, bounds: Bounds
+) -> tuple[Ints, Floats32]:
     """Project a cloud to square cells of an image.
 
     Args:
@@ -45,7 +40,7 @@ def project_to_cells(
 
 
 @kernel("(i8[:,::1], f4[::1], f4)")
-def bin_depths(cells: Cells, z: Depth, no_depth: float) -> tuple[Cells, Depth]:
+def bin_depths(cells: Ints, z: Floats32, no_depth: float) -> tuple[Ints, Floats32]:
     """Minimum and maximum depth of the points in each cell.
 
     Args:
@@ -68,21 +63,21 @@ def bin_depths(cells: Cells, z: Depth, no_depth: float) -> tuple[Cells, Depth]:
 
 
 @device
-def _compare(z: Depth, low: Depth, high: Depth, inside: Mask) -> None:
+def _compare(z: Floats32, low: Floats32, high: Floats32, inside: Bools) -> None:
     for i in range(inside.size):
         inside[i] = (z[i] > low[i]) & (z[i] < high[i])
 
 
 @device
-def _add_missing(z: Depth, low: Depth, no_depth: float, inside: Mask) -> None:
+def _add_missing(z: Floats32, low: Floats32, no_depth: float, inside: Bools) -> None:
     for i in range(inside.size):
         inside[i] |= (z[i] <= 0) & (low[i] < no_depth)
 
 
 @kernel("(f4[:,:,::1], f4[:,::1], UniTuple(i8, 4), UniTuple(i8, 4), f4, f4, b1[:,::1])")
 def select_pixels(
-    minima: Depth, depth: Depth, box: tuple[int, int, int, int], grid: tuple[int, int, int, int], tolerance: float,
-    no_depth: float, mask: Mask,
+    minima: Floats32, depth: Floats32, box: tuple[int, int, int, int], grid: tuple[int, int, int, int],
+    tolerance: float, no_depth: float, mask: Bools,
 ) -> None:  # fmt: skip
     """Select the pixels of a box whose depth lies within the range of their cell.
 

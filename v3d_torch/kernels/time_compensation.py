@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats, Floats32, Ints
 from v3d_torch.kernels.compiler import device, kernel
 
-Array = NDArray[np.float64]
-Intrinsics = tuple[float, float, float, float]
+PinholeIntrinsics = tuple[float, float, float, float]
+"""``fx, fy, cx, cy`` of a camera without lens distortion; in signatures ``UniTuple(f8, 4)``."""
 
 
 @device
 def _motion_field(
-    u: float, v: float, inverse_depth: float, velocity: Array, intrinsics: Intrinsics
+    u: float, v: float, inverse_depth: float, velocity: Floats, intrinsics: PinholeIntrinsics
 ) -> tuple[float, float, float]:
     """Velocity of a pixel and rate of its inverse depth, by the formula of `v3d_torch.geometry.motion_field`."""
     fx, fy, cx, cy = intrinsics
@@ -25,9 +25,9 @@ def _motion_field(
 
 @kernel("(f8[:,::1], i8[:,::1], f8[::1], f4[:,::1], f8[::1], f8, f8, UniTuple(f8, 4))")
 def compensate_depth_delay(
-    uv: Array, pixel: NDArray[np.int64], inverse_depth: Array, depth_image: NDArray[np.float32], velocity: Array,
-    delay: float, max_depth: float, intrinsics: Intrinsics,
-) -> Array:  # fmt: skip
+    uv: Floats, pixel: Ints, inverse_depth: Floats, depth_image: Floats32, velocity: Floats,
+    delay: float, max_depth: float, intrinsics: PinholeIntrinsics,
+) -> Floats:  # fmt: skip
     """Depth of features at the time of the colour image, metres, (N,); 0 = no measurement.
 
     Args:
@@ -55,9 +55,9 @@ def compensate_depth_delay(
 
 @kernel("(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[:,::1], f8, i8)")
 def compensate_rolling_shutter(
-    uv: Array, row: Array, inverse_depth: Array, velocity: Array, K: Array, readout_jacobian: Array, readout: float,
-    rows: int,
-) -> tuple[Array, Array]:  # fmt: skip
+    uv: Floats, row: Floats, inverse_depth: Floats, velocity: Floats, K: Floats, readout_jacobian: Floats,
+    readout: float, rows: int,
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Pixels of features at the time of the middle row, and their derivatives by the readout, both (N, 2).
 
     Args:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats32, Ints
 from v3d_torch.kernels.compiler import kernel
-from v3d_torch.kernels.radix_sort import Ints, argsort
-
-Points = NDArray[np.float32]
+from v3d_torch.kernels.radix_sort import argsort
 
 
 @kernel("(f4[:,::1], f4, f8)")
-def pool_voxels(points: Points, size: np.float32, max_voxels: float) -> tuple[Points, Ints, Ints]:
+def pool_voxels(points: Floats32, size: np.float32, max_voxels: float) -> tuple[Floats32, Ints, Ints]:
     """Mean point of each occupied voxel of one cloud, sorted by x, then y, then z.
 
     Args:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Bytes, Ints, SignedBytes
 from v3d_torch.kernels.compiler import device, kernel
 
 BITS = 4
@@ -22,10 +22,6 @@ FREE, HIT = 1, 2
 UNKNOWN = -128
 """Log-odds of voxels that were never observed, different from those of all other voxels."""
 
-Ints = NDArray[np.int64]
-
-Marks = NDArray[np.uint8]
-
 
 @device
 def local_index(x: int, y: int, z: int) -> int:
@@ -35,7 +31,7 @@ def local_index(x: int, y: int, z: int) -> int:
 
 @kernel("(i1[:,::1], i8[::1], u1[:,::1], i8, i8, i8, i8)")
 def add_observations(
-    log_odds: NDArray[np.int8], rows: Ints, marks: Marks, hit: int, miss: int, minimum: int, maximum: int
+    log_odds: SignedBytes, rows: Ints, marks: Bytes, hit: int, miss: int, minimum: int, maximum: int
 ) -> None:
     """Add the observations of one view to the log-odds of blocks.
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from v3d_torch.kernels.arrays import Floats
 from v3d_torch.kernels.compiler import kernel
-
-Array = NDArray[np.float64]
 
 
 @kernel("(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[:,:,::1])")
 def whiten(
-    uv: Array, inverse_depth: Array, pixel_sigma: Array, inverse_depth_sigma: Array, K: Array
-) -> tuple[Array, Array]:  # fmt: skip
+    uv: Floats, inverse_depth: Floats, pixel_sigma: Floats, inverse_depth_sigma: Floats, K: Floats
+) -> tuple[Floats, Floats]:  # fmt: skip
     """Scale and offset of the whitened residuals of B batches of M measurements, both (B, 3, M).
 
     Args:
