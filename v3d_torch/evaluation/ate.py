@@ -14,6 +14,7 @@ from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
+from v3d_torch.geometry.se3 import to_matrix
 from v3d_torch.runtime.batches import fill_padding, mask_or_all
 
 _MIN_PLANE_SPREAD = 1e-3
@@ -141,8 +142,7 @@ def align(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None, *, oriented: 
     R = nearest_rotation((between if valid is None else between * valid[..., None, None]).sum(dim=-3))
     weights = None if valid is None else valid[..., None].to(p_g.dtype)
     t = weighted_mean(p_g, weights) - (R @ weighted_mean(p_e, weights)[..., None])[..., 0]
-    rotated = torch.cat([torch.cat([R, t[..., None]], dim=-1), T_ge[..., 3:, :]], dim=-2)
-    return Alignment(torch.where(by_orientations[..., None, None], rotated, T_ge), by_orientations)
+    return Alignment(torch.where(by_orientations[..., None, None], to_matrix(R, t), T_ge), by_orientations)
 
 
 def absolute_errors(T_gc: Tensor, T_ec: Tensor, alignment: Alignment) -> Tensor:

@@ -10,7 +10,7 @@ from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
-from v3d_torch.geometry.se3 import se3_exp
+from v3d_torch.geometry.se3 import se3_exp, to_matrix
 from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
 from v3d_torch.runtime.batches import fill_padding
 
@@ -65,9 +65,7 @@ def umeyama(
         spread = (a.square() if w is None else a.square() * w).sum(dim=(-2, -1))
         scale = (R * M).sum(dim=(-2, -1)) / torch.where(spread > 0, spread, 1.0)
         R = R * torch.where(spread > 0, scale, 1.0)[..., None, None]
-    top = torch.cat([R, (mean_b - (R @ mean_a[..., None])[..., 0])[..., None]], dim=-1)
-    last = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
-    return torch.cat([top, last], dim=-2).to(result_dtype(p.dtype))
+    return to_matrix(R, mean_b - (R @ mean_a[..., None])[..., 0]).to(result_dtype(p.dtype))
 
 
 def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, to_matrix
 
 _ROOT_ITERATIONS = 40
 """Iterations for the roots: some dozens from the start to the neighbourhood of the roots, then convergence is
@@ -77,8 +77,6 @@ def _align_triangles(world: Tensor, camera: Tensor) -> Tensor:
         x = torch.nn.functional.normalize(second - first, dim=-1)
         z = torch.nn.functional.normalize(torch.linalg.cross(x, third - first, dim=-1), dim=-1)
         axes = torch.stack([x, torch.linalg.cross(z, x, dim=-1), z], dim=-1)
-        frame = torch.cat([axes, first[..., None]], dim=-1)
-        last = torch.eye(4, dtype=frame.dtype, device=frame.device)[3:].expand(*frame.shape[:-2], 1, 4)
-        frames.append(torch.cat([frame, last], dim=-2))
+        frames.append(to_matrix(axes, first))
     T_wt, T_ct = frames
     return T_ct @ invert(T_wt)

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from v3d_torch.geometry.se3 import to_matrix
+
 _STEEP = math.radians(10)
 """Angle to the vertical below which the optical axis of the first camera has no clear horizontal direction."""
 
@@ -31,5 +33,4 @@ def level_frame(up: Tensor) -> Tensor:
     forward = torch.where(is_steep, below * z[..., 2:].sign(), ahead)
     x = normalize(forward - (forward * z).sum(dim=-1, keepdim=True) * z, dim=-1)
     R = torch.stack([x, torch.linalg.cross(z, x), z], dim=-2)
-    bottom = z.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*z.shape[:-1], 1, 4)
-    return torch.cat([torch.cat([R, torch.zeros_like(z)[..., None]], dim=-1), bottom], dim=-2)
+    return to_matrix(R, torch.zeros_like(z))

@@ -56,6 +56,20 @@ def _is_single(tensor: Tensor, *shape: int) -> bool:
     return tensor.shape == shape and tensor.dtype == torch.float64
 
 
+def to_matrix(R: Tensor, t: Tensor) -> Tensor:
+    """Join rotations and translations to matrices with the last row (0, 0, 0, 1).
+
+    Args:
+        R: Rotations, or rotations times a scale, shape :math:`(..., 3, 3)`.
+        t: Translations, shape :math:`(..., 3)`.
+
+    Returns:
+        Shape :math:`(..., 4, 4)`.
+    """
+    last = torch.eye(4, dtype=R.dtype, device=R.device)[3:].expand(*R.shape[:-2], 1, 4)
+    return torch.cat([torch.cat([R, t[..., None]], dim=-1), last], dim=-2)
+
+
 def _invert_compiled(T: Tensor) -> Tensor:
     return torch.from_numpy(kernels.invert(to_array(T))) if _is_single(T, 4, 4) else NotImplemented
 
@@ -64,7 +78,7 @@ def _invert_compiled(T: Tensor) -> Tensor:
 def invert(T: Tensor) -> Tensor:
     """Invert rigid motions, shape :math:`(..., 4, 4)`: ``invert(T_wc)`` is ``T_cw``."""
     R = T[..., :3, :3].mT
-    return _assemble(R, 0.0 - R @ T[..., :3, 3:])  # no negative zeros
+    return to_matrix(R, 0.0 - (R @ T[..., :3, 3:])[..., 0])  # no negative zeros
 
 
 def _orthonormalise_compiled(T: Tensor) -> Tensor:
@@ -89,7 +103,7 @@ def orthonormalise(T: Tensor) -> Tensor:
     """
     M, is_unknown = zero_if_not_finite(T[..., :3, :3])
     U, _, Vh = torch.linalg.svd(M)
-    return _assemble(torch.where(is_unknown, torch.nan, U @ Vh), T[..., :3, 3:])
+    return to_matrix(torch.where(is_unknown, torch.nan, U @ Vh), T[..., :3, 3])
 
 
 def are_rigid(T: Tensor, tolerance: float) -> Tensor:
@@ -109,12 +123,6 @@ def are_rigid(T: Tensor, tolerance: float) -> Tensor:
     is_affine = (T[..., 3, :] == identity[3]).all(dim=-1)
     # A comparison with NaN is false.
     return T.isfinite().all(dim=(-2, -1)) & is_affine & (error <= tolerance) & (torch.linalg.det(R) > 0)
-
-
-def _assemble(R: Tensor, t: Tensor) -> Tensor:
-    """Matrices (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3, 1), with an exact last row."""
-    last = torch.eye(4, dtype=R.dtype, device=R.device)[3:].expand(*R.shape[:-2], 1, 4)
-    return torch.cat([torch.cat([R, t], dim=-1), last], dim=-2)
 
 
 def _se3_exp_compiled(xi: Tensor) -> Tensor:
