@@ -18,7 +18,7 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.objects import free_space_check as module
+from v3d_torch.objects import image_scale
 from v3d_torch.objects.free_space_check import (
     DepthView,
     FreeSpaceCheck,
@@ -38,7 +38,7 @@ TWISTS = st.tuples(*[st.floats(-2.0, 2.0)] * 3, *[st.floats(-1.5, 1.5)] * 3)
 @pytest.fixture(autouse=True)
 def every_fourth_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Check every 4th pixel, as with a camera of the usual size."""
-    monkeypatch.setattr(module, "_COLUMNS", CAMERA.width // 4)
+    monkeypatch.setattr(image_scale, "_COARSE_COLUMNS", CAMERA.width // 4)
 
 
 def surface(columns: tuple[int, int], rows: tuple[int, int] = (40, 80), z: float = OBJECT) -> Tensor:

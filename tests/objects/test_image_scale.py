@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.image_scale import scale_to_image
+from v3d_torch.objects.image_scale import coarse_stride, scale_to_image
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.types import Instances
 
@@ -40,6 +40,11 @@ def test_values_are_scaled(
     mask = scaled.static_mask
     assert scaled.clouds.stride == stride
     assert (mask.dilation, mask.map_dilation, mask.depth_margin, mask.surface_margin) == margins
+
+
+def test_coarse_images_have_about_160_columns() -> None:
+    sizes = ((640, 480), (1280, 720), (848, 480), (424, 240), (320, 240), (64, 48))
+    assert [coarse_stride(camera_of(*size, 525.0)) for size in sizes] == [4, 8, 5, 3, 2, 1]
 
 
 @given(st.integers(16, 4000), st.floats(10, 4000))

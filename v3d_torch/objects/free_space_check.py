@@ -24,11 +24,9 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.kernels import free_space as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.depth_view import DepthView, SpaceView, StoredView
+from v3d_torch.objects.image_scale import coarse_stride
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.types import MIN_INTERVAL, STAMP_TOLERANCE
-
-_COLUMNS = 160
-"""Number of pixels checked in a row: every 4th of a Kinect's. They are 2 cm apart at 2.5 m, as dense as the clouds."""
 
 _VIEW_MARGIN = 0.2
 """Views are kept for this much longer than the longest time span, seconds: at 5 frames per second, the newest view that
@@ -164,7 +162,7 @@ class FreeSpaceCheck:
         self._config = config
         self._camera = camera
         self._views: list[StoredView] = []
-        self._stride = max(1, round(camera.width / _COLUMNS))
+        self._stride = coarse_stride(camera)
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
     def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, is_motion_measured: bool = True) -> DepthView:

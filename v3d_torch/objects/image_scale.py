@@ -13,6 +13,19 @@ from v3d_torch.geometry.pixel_scale import pixel_scale
 
 _FOCAL_LENGTH = 525.0
 
+_COARSE_COLUMNS = 160
+"""Number of columns of coarse images. Pixels are 2 cm apart at 2.5 m, as dense as the clouds, and masks keep more
+detail than the network's own masks have, with 104 columns by default."""
+
+
+def coarse_stride(camera: PinholeCamera) -> int:
+    """Stride of the pixels of coarse images, in which views and masks are compared: 4 for a Kinect.
+
+    Args:
+        camera: Camera of the images.
+    """
+    return max(round(camera.width / _COARSE_COLUMNS), 1)
+
 
 def scale_to_image(config: ObjectsConfig, camera: PinholeCamera) -> ObjectsConfig:
     """Scale margins of masks and stride of clouds to the number of columns, and the stride to a shorter focal length.

@@ -13,6 +13,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
+from v3d_torch.objects.image_scale import coarse_stride
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
 from v3d_torch.objects.track import Track
@@ -26,10 +27,6 @@ from v3d_torch.objects.track_matching import (
 )
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE, Instances
-
-_COARSE_COLUMNS = 160
-"""Number of columns of the coarse masks that are compared: more than the network's own masks have, which is 104 by
-default."""
 
 _DUPLICATE_COVERAGE = 0.7
 """An unmatched instance is a second detection of an object if the mask of a matched instance of the class and its own
@@ -82,7 +79,7 @@ class InstanceTracker(torch.nn.Module):
         self._config = config
         self._camera = camera
         self._clouds = clouds
-        self._stride = max(1, camera.width // _COARSE_COLUMNS)
+        self._stride = coarse_stride(camera)
         self._next_id = 1
         self._last_stamp = -torch.inf
         self.tracks: list[Track] = []
