@@ -125,7 +125,7 @@ def score(case: Case, result: Result, plain: Result, T_gc: Tensor) -> Score:
     shown, positions = torch.tensor(case.shown), torch.tensor(case.plain)
     truth = T_gc[shown.clamp(min=0)]
     observed = (shown != COVERED) & truth[:, 0, 3].isfinite()
-    found = observed & torch.tensor([status.is_located for status in result.statuses])
+    found = observed & torch.tensor([status.is_localised for status in result.statuses])
     common = found & (positions != NO_POSITION)
     errors = absolute_errors(truth, result.T_wc, align(truth[common], result.T_wc[common]))
     true, T_plain = truth[common], plain.T_wc[positions[common]]

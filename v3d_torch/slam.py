@@ -391,7 +391,7 @@ class V3DSLAM(FramePreprocessor):
     def _predict(self) -> PosePrediction | None:
         """Predict the motion of the camera; None if it has not been localised in a known map yet."""
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
-        return self.motion_model.predict(self.poses) if is_new_map or self.poses.is_localised else None
+        return self.motion_model.predict(self.poses) if is_new_map or self.poses.was_found else None
 
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
         """Apply a correction of the map to all other data that is stored in the world frame."""

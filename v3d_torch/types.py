@@ -227,7 +227,7 @@ class TrackingStatus(StrEnum):
     """Not found: predicted, and interpolated after the camera is found again."""
 
     @property
-    def is_located(self) -> bool:
+    def is_localised(self) -> bool:
         """True if the pose is known relative to the whole map."""
         return self in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
 

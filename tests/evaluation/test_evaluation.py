@@ -70,18 +70,18 @@ def test_lost_poses_do_not_indicate_depth_unit() -> None:
     groundtruth.T_wc[:, :3, 3] = torch.linspace(0, 1, 60, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0, 0])
     estimate = Trajectory(groundtruth.stamps, groundtruth.T_wc.clone())
     estimate.T_wc[30:, :3, 3] = estimate.T_wc[29, :3, 3]
-    is_located = torch.arange(60) < 30
+    is_localised = torch.arange(60) < 30
     assert "times as large" in " ".join(evaluate(groundtruth, estimate).notes)
-    evaluation = evaluate(groundtruth, estimate, is_located=is_located)
+    evaluation = evaluate(groundtruth, estimate, is_localised=is_localised)
     assert "times as large" not in " ".join(evaluation.notes) and evaluation.ate.rmse > 0.1
     estimate.T_wc[:, :3, 3] /= 5
-    assert "is 5 times as large" in " ".join(evaluate(groundtruth, estimate, is_located=is_located).notes)
+    assert "is 5 times as large" in " ".join(evaluate(groundtruth, estimate, is_localised=is_localised).notes)
     two = torch.arange(60) < 2
-    assert "times as large" not in " ".join(evaluate(groundtruth, estimate, is_located=two).notes)
-    with pytest.raises(InputError, match=r"^is_located has the type torch\.int64; give a mask of type torch\.bool$"):
-        evaluate(groundtruth, estimate, is_located=is_located.long())
-    with pytest.raises(InputError, match=r"^is_located has 59 values for 60 poses; give one for each pose$"):
-        evaluate(groundtruth, estimate, is_located=is_located[1:])
+    assert "times as large" not in " ".join(evaluate(groundtruth, estimate, is_localised=two).notes)
+    with pytest.raises(InputError, match=r"^is_localised has the type torch\.int64; give a mask of type torch\.bool$"):
+        evaluate(groundtruth, estimate, is_localised=is_localised.long())
+    with pytest.raises(InputError, match=r"^is_localised has 59 values for 60 poses; give one for each pose$"):
+        evaluate(groundtruth, estimate, is_localised=is_localised[1:])
 
 
 @pytest.mark.parametrize("name", ["ground truth", "estimate"])

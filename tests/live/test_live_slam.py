@@ -65,7 +65,7 @@ def test_each_result_has_state_and_times() -> None:
         assert result.status is TrackingStatus.TRACKED
         assert start < result.captured_at < result.finished_at < time.monotonic()
         assert result.latency == result.finished_at - result.captured_at
-        assert result.pose_latency == result.located_at - result.captured_at
+        assert result.pose_latency == result.measured_at - result.captured_at
         assert torch.linalg.eigvalsh(result.covariance).min() >= 0
         assert result.twist.shape == (6,)
     assert live.pose_at(results[3].stamp).T_wc.allclose(results[3].T_wc, atol=1e-3)

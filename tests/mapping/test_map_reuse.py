@@ -153,7 +153,7 @@ def test_camera_in_another_room_stays_lost_and_leaves_the_map_unchanged(
     elsewhere = Slide(640, 960, step=16, seed=5)
     second = run(elsewhere, CONFIG, load_map(path, CAMERA, CONFIG))
     assert second.slam.poses.statuses == [TrackingStatus.LOST] * len(elsewhere)
-    assert not second.slam.poses.is_localised
+    assert not second.slam.poses.was_found
     save_map(tmp_path / "after.map", second.slam.mapper.map, second.views)
     assert (tmp_path / "after.map").read_bytes() == path.read_bytes()
 

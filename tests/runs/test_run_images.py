@@ -17,7 +17,7 @@ from helpers.wall_run import FRAMES, StoredWall, Wall
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import se3_exp
-from v3d_torch.runs.run_images import LocatedFrames, located_frames, posed_images
+from v3d_torch.runs.run_images import LocalisedFrames, localised_frames, posed_images
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.types import RGBDFrame, TrackingStatus, Trajectory
 
@@ -52,14 +52,14 @@ def test_frames_with_a_known_pose_have_their_positions_in_the_source_and_their_p
     run = make_run(tmp_path, TRACKED, LOST, DISCONNECTED, ODOMETRY, TRACKED, TRACKED)
     assert run.trajectory is not None
     for only_keyframes, rows, indices in ((False, [0, 3, 4, 5], [0, 4, 5, 6]), (True, [0, 4], [0, 5])):
-        frames = located_frames(run, only_keyframes=only_keyframes)
+        frames = localised_frames(run, only_keyframes=only_keyframes)
         assert frames.indices == indices and len(frames) == len(rows)
         assert torch.equal(frames.poses.stamps, run.trajectory.stamps[rows])
         assert torch.equal(frames.poses.T_wc, run.trajectory.T_wc[rows])
 
 
 def test_every_second_frame_keeps_its_pose(tmp_path: Path) -> None:
-    frames = located_frames(make_run(tmp_path, *[TRACKED] * 6))
+    frames = localised_frames(make_run(tmp_path, *[TRACKED] * 6))
     second = frames.every(2)
     assert second.indices == [0, 3, 5]
     assert torch.equal(second.poses.stamps, frames.poses.stamps[[0, 2, 4]])
@@ -68,19 +68,19 @@ def test_every_second_frame_keeps_its_pose(tmp_path: Path) -> None:
 
 def test_run_that_never_found_the_camera_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no frame with a known pose; run another sequence"):
-        located_frames(make_run(tmp_path, LOST, LOST, DISCONNECTED))
+        localised_frames(make_run(tmp_path, LOST, LOST, DISCONNECTED))
 
 
-def frames_at(*stamps: float) -> LocatedFrames:
+def frames_at(*stamps: float) -> LocalisedFrames:
     """Frames of the wall with the given timestamps, from the first one on."""
     poses = Trajectory(torch.tensor(stamps, dtype=torch.float64), se3_exp(torch.zeros(len(stamps), 6).double()))
-    return LocatedFrames(list(range(len(stamps))), poses)
+    return LocalisedFrames(list(range(len(stamps))), poses)
 
 
 @pytest.mark.parametrize("source", [StoredWall(), LiveWall()], ids=["sequence", "stream"])
 def test_all_frames_are_read_from_a_sequence_and_from_a_stream(source: RGBDStream, tmp_path: Path) -> None:
     run = make_run(tmp_path, *[TRACKED] * (FRAMES - 1))
-    images = list(posed_images(run, source, located_frames(run), masks=False))
+    images = list(posed_images(run, source, localised_frames(run), masks=False))
     assert [image.frame.index for image in images] == [0, 1, *range(3, FRAMES)]
     assert all(bool(image.static.all()) for image in images)
 

@@ -83,7 +83,7 @@ def test_frame_without_landmarks_does_not_move_with_another_part_of_the_map() ->
     assert missed.status is ODOMETRY
     camera.append(0.3, missed, tracker.reference_keyframe(missed, camera.poses), EYE)
     sparse_map.move_keyframes(torch.stack([EYE, se3_exp(TWIST)]))
-    assert camera.poses.is_located and torch.equal(camera.poses.T_cw, EYE)
+    assert camera.poses.is_localised and torch.equal(camera.poses.T_cw, EYE)
 
 
 def test_reference_keyframe_of_a_first_frame_without_landmarks_is_the_last_keyframe() -> None:

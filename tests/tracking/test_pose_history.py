@@ -123,10 +123,10 @@ def true_pose(index: int) -> Tensor:
 
 def test_frames_before_the_first_found_one_follow_measured_motions() -> None:
     camera = begin_lost(5)
-    assert not camera.poses.is_localised
+    assert not camera.poses.was_found
     found = keyframe(true_pose(5))
     T_new_old = camera.append(0.5, frame_pose(true_pose(5), landmarks=(1,)), found, STEP)
-    assert camera.poses.is_localised and T_new_old is not None
+    assert camera.poses.was_found and T_new_old is not None
     torch.testing.assert_close(T_new_old, invert(HIDDEN), rtol=0, atol=1e-9)
     assert camera.poses.statuses == [*5 * [TrackingStatus.ODOMETRY], TrackingStatus.TRACKED]
     expected = invert(torch.stack([true_pose(index) for index in range(6)]))

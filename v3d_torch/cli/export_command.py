@@ -28,7 +28,7 @@ from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import RunRequest, read_request
-from v3d_torch.runs.run_images import LocatedFrames, located_frames, open_images, posed_images
+from v3d_torch.runs.run_images import LocalisedFrames, localised_frames, open_images, posed_images
 from v3d_torch.runs.stored_run import StoredRun, read_run
 
 _MAX_IMAGES = 300
@@ -88,7 +88,7 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
         out_camera, shown = undistort.camera, map(undistort, shown)
     with emptied_on_failure(out):  # else, the same command would reject the folder
         notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
-    if left_out := len(run.metrics.status) - len(located_frames(run)):
+    if left_out := len(run.metrics.status) - len(localised_frames(run)):
         notes.append(f"{left_out} frames without a known pose are left out")
     print_line(console, f"{len(frames)} images: {out}")
     for note in notes:
@@ -109,13 +109,13 @@ class _Export:
     run: StoredRun
     request: RunRequest
     source: RGBDStream
-    frames: LocatedFrames
+    frames: LocalisedFrames
 
 
-def _select_frames(run: StoredRun, options: ExportOptions) -> LocatedFrames:
-    located = located_frames(run, only_keyframes=options.keyframes)
+def _select_frames(run: StoredRun, options: ExportOptions) -> LocalisedFrames:
+    localised = localised_frames(run, only_keyframes=options.keyframes)
     takes_all = options.format == "tum" or options.keyframes
-    return located.every(options.every or (1 if takes_all else -(-len(located) // _MAX_IMAGES)))
+    return localised.every(options.every or (1 if takes_all else -(-len(localised) // _MAX_IMAGES)))
 
 
 def _write_nerfstudio(out: Path, export: _Export, camera: PinholeCamera, images: Iterable[PosedImage]) -> list[str]:

@@ -74,7 +74,7 @@ def evaluate(
     max_time_difference: float = MAX_TIME_DIFFERENCE,
     rpe_delta: float = 1.0,
     frames: int | None = None,
-    is_located: Tensor | None = None,
+    is_localised: Tensor | None = None,
 ) -> Evaluation:
     """Evaluate a trajectory by the protocol of the TUM RGB-D benchmark, which the paper's tables follow.
 
@@ -88,12 +88,13 @@ def evaluate(
         max_time_difference: Maximum difference between the timestamps of a pair, seconds, at least 0.
         rpe_delta: Time over which the RPE measures drift, seconds.
         frames: Number of colour-depth pairs of the sequence, for the coverage.
-        is_located: True for each pose of the estimate that was measured relative to the map, bool, shape :math:`(N,)`;
-            None if this is not known. The other poses count for the errors, but do not indicate the scale of depth.
+        is_localised: True for each pose of the estimate that was measured relative to the map, bool, shape
+            :math:`(N,)`; None if this is not known. The other poses count for the errors, but do not indicate the
+            scale of depth.
 
     Raises:
         InputError: If fewer than three poses can be associated, if an argument is not a trajectory, if an associated
-            pose is not finite, or if ``is_located`` is not a mask of the poses.
+            pose is not finite, or if ``is_localised`` is not a mask of the poses.
         ConfigError: If ``max_time_difference`` is negative or not a number, or ``rpe_delta`` is not positive.
     """
     for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
@@ -102,9 +103,11 @@ def evaluate(
                 f"the {name} is a {type(value).__name__}, not a Trajectory; read a file with read_trajectory, or build"
                 " a Trajectory from arrays"
             )
-    check_masks(is_located=is_located)
-    if is_located is not None and len(is_located) != len(estimate):
-        raise InputError(f"is_located has {len(is_located)} values for {len(estimate)} poses; give one for each pose")
+    check_masks(is_localised=is_localised)
+    if is_localised is not None and len(is_localised) != len(estimate):
+        raise InputError(
+            f"is_localised has {len(is_localised)} values for {len(estimate)} poses; give one for each pose"
+        )
     if not max_time_difference >= 0:  # also for NaN
         raise ConfigError(f"max_time_difference is {max_time_difference}; give a time of at least 0 seconds")
     matches = associate_trajectories(groundtruth, estimate, max_time_difference)
@@ -123,11 +126,11 @@ def evaluate(
     notes = []
     if alignment.source is RotationSource.ORIENTATIONS:
         notes.append("the ground-truth positions do not span a plane: aligned by the mean of the orientations")
-    if is_located is None or bool(is_located[matches.estimate].all()):
+    if is_localised is None or bool(is_localised[matches.estimate].all()):
         factor = scale_error(T_gc, T_ec, alignment)
     else:
-        located = is_located[matches.estimate]
-        factor = _located_scale_error(T_gc[located], T_ec[located], oriented)
+        localised = is_localised[matches.estimate]
+        factor = _localised_scale_error(T_gc[localised], T_ec[localised], oriented)
     if factor is not None:
         notes.append(f"the ground truth is {factor:.3g} times as large as the estimate: check depth_scale")
     rpe = relative_pose_error(groundtruth, estimate, matches, rpe_delta) if oriented else None
@@ -198,7 +201,7 @@ def _coverage(poses: int, frames: int | None) -> float | None:
     return min(poses / frames, 1.0) if frames else None
 
 
-def _located_scale_error(T_gc: Tensor, T_ec: Tensor, oriented: bool) -> float | None:
+def _localised_scale_error(T_gc: Tensor, T_ec: Tensor, oriented: bool) -> float | None:
     """Compute the scale error of the poses that were measured relative to the map; None if there are too few."""
     if len(T_gc) < MIN_PAIRS:
         return None

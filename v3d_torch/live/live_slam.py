@@ -29,7 +29,7 @@ class LiveResult(FrameResult):
         frame: Frame to which the result belongs.
         captured_at: Time of capture in the clock of the computer (`time.monotonic`), seconds; ``stamp`` is the time in
             the clock of the camera.
-        located_at: Time in the clock of the computer, seconds, at which the motion since the previous frame was
+        measured_at: Time in the clock of the computer, seconds, at which the motion since the previous frame was
             measured, from which `pose_at` computes the pose of this frame before its objects are known; the time of
             this result if the motion was not measured.
         finished_at: Time of this result in the clock of the computer, seconds.
@@ -38,7 +38,7 @@ class LiveResult(FrameResult):
 
     frame: RGBDFrame
     captured_at: float
-    located_at: float
+    measured_at: float
     finished_at: float
     dropped: int
 
@@ -50,7 +50,7 @@ class LiveResult(FrameResult):
     @property
     def pose_latency(self) -> float:
         """Time from the capture of the frame to its first pose, seconds."""
-        return self.located_at - self.captured_at
+        return self.measured_at - self.captured_at
 
 
 class LiveSLAM:
@@ -112,14 +112,14 @@ class LiveSLAM:
                 result = self.slam.track(live.preprocessed)
                 preprocessor.end_tracking()
                 finished_at, captured = self._clock.now(), live.captured
-                located_at = finished_at if self._measured_at is None else self._measured_at
+                measured_at = finished_at if self._measured_at is None else self._measured_at
                 dropped, number = captured.number - number - 1, captured.number
                 self.dropped += dropped
                 yield LiveResult(
                     **vars(result),
                     frame=captured.frame,
                     captured_at=captured.captured_at,
-                    located_at=located_at,
+                    measured_at=measured_at,
                     finished_at=finished_at,
                     dropped=dropped,
                 )

@@ -87,7 +87,7 @@ class OccupancyMapper:
         """
         self.up = up or self.up
         frame = len(poses) - 1
-        if frame % self._config.interval != 0 or not poses.is_located:
+        if frame % self._config.interval != 0 or not poses.is_localised:
             return
         view = RangeView.sample(self._count, depth[0], static, self._config.stride)
         self._store.append(view, frame, poses.T_cw, torch.eye(4, dtype=torch.float64) if T_dc is None else T_dc)

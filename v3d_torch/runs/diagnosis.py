@@ -48,7 +48,7 @@ def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | N
     name, count = pipeline.sequence.name, len(pipeline.slam.poses)
     if not count:
         return f"{name}: has no frames; record it again"
-    if pipeline.slam.poses.is_localised:
+    if pipeline.slam.poses.was_found:
         return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
     if request.load_map is not None:
         return (

@@ -43,7 +43,7 @@ class Metrics(BaseModel):
     machine: dict[str, Any]
 
     @property
-    def is_localised(self) -> bool:
+    def was_found(self) -> bool:
         """True if the camera was found in any frame."""
         return any(status is not TrackingStatus.LOST for status in self.status)
 

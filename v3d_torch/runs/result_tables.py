@@ -96,10 +96,10 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
     keyframes = slam.map.own_keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
     evaluation = None
-    if groundtruth is not None and slam.poses.is_localised:
+    if groundtruth is not None and slam.poses.was_found:
         with suppress(InputError):  # too few poses for scores
-            is_located = torch.tensor([status.is_located for status in slam.poses.statuses])
-            evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count, is_located=is_located)
+            is_localised = torch.tensor([status.is_localised for status in slam.poses.statuses])
+            evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count, is_localised=is_localised)
     return ResultTables(
         trajectory=trajectory,
         keyframes=Trajectory(stamps, invert(stack_poses(keyframes))),

@@ -54,7 +54,7 @@ def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) 
 
 
 @dataclass(frozen=True)
-class LocatedFrames:
+class LocalisedFrames:
     """Frames of a run with a known pose.
 
     Attributes:
@@ -68,13 +68,13 @@ class LocatedFrames:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def every(self, step: int) -> LocatedFrames:
+    def every(self, step: int) -> LocalisedFrames:
         """Return every n-th frame."""
         poses = Trajectory(self.poses.stamps[::step], self.poses.T_wc[::step])
-        return LocatedFrames(self.indices[::step], poses)
+        return LocalisedFrames(self.indices[::step], poses)
 
 
-def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFrames:
+def localised_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocalisedFrames:
     """Select the frames whose pose is known relative to the whole map.
 
     Args:
@@ -86,7 +86,7 @@ def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFr
     """
     table = [] if run.frames is None else run.frames.select(["frame", "keyframe"]).to_pylist()
     # Broken frames have no row and no pose.
-    rows = [position for position, status in enumerate(run.metrics.status[: len(table)]) if status.is_located]
+    rows = [position for position, status in enumerate(run.metrics.status[: len(table)]) if status.is_localised]
     if not rows or run.trajectory is None:
         raise InputError(f"{run.folder}: has no frame with a known pose; run another sequence")
     if only_keyframes:
@@ -94,10 +94,10 @@ def located_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocatedFr
     if not rows:  # a run with --localise makes no keyframes
         raise InputError(f"{run.folder}: has no keyframe with a known pose; export without --keyframes")
     poses = Trajectory(run.trajectory.stamps[rows], run.trajectory.T_wc[rows])
-    return LocatedFrames([table[position]["frame"] for position in rows], poses)
+    return LocalisedFrames([table[position]["frame"] for position in rows], poses)
 
 
-def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, masks: bool) -> Iterator[PosedImage]:
+def posed_images(run: StoredRun, source: RGBDStream, frames: LocalisedFrames, *, masks: bool) -> Iterator[PosedImage]:
     """Read frames with their poses and masks, one after the other.
 
     Args:
@@ -124,7 +124,9 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, *, m
     return _read_images(run, source, frames, folder if masks else None)
 
 
-def _read_images(run: StoredRun, source: RGBDStream, frames: LocatedFrames, masks: Path | None) -> Iterator[PosedImage]:
+def _read_images(
+    run: StoredRun, source: RGBDStream, frames: LocalisedFrames, masks: Path | None
+) -> Iterator[PosedImage]:
     images = _read_frames(source, frames.indices)
     for frame, stamp, T_wc in zip(images, frames.poses.stamps.tolist(), frames.poses.T_wc, strict=False):
         if abs(frame.stamp - stamp) > _STAMP_TOLERANCE:

@@ -81,10 +81,10 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     truth_path = groundtruth or folder / RunFile.GROUNDTRUTH
     truth = read_trajectory(truth_path) if groundtruth is not None or truth_path.is_file() else None
     evaluation = None
-    if truth is not None and trajectory is not None and metrics.is_localised:
+    if truth is not None and trajectory is not None and metrics.was_found:
         try:
-            is_located = torch.tensor([status.is_located for status in metrics.status])
-            evaluation = evaluate(truth, trajectory, frames=metrics.frames, is_located=is_located)
+            is_localised = torch.tensor([status.is_localised for status in metrics.status])
+            evaluation = evaluate(truth, trajectory, frames=metrics.frames, is_localised=is_localised)
         except InputError as error:
             if groundtruth is not None:
                 raise InputError(f"{groundtruth}: {error}") from error

@@ -80,7 +80,7 @@ class CameraTracker:
                 return FramePose(
                     TrackingStatus.TRACKED, tracking.T_cw, tracking.landmarks, tracking.information, is_relocalised
                 )
-        known = motion.is_measured and poses.is_located
+        known = motion.is_measured and poses.is_localised
         status = TrackingStatus.ODOMETRY if known else TrackingStatus.LOST
         return FramePose(status, T_cw, torch.full((len(features),), -1, dtype=torch.int64))
 

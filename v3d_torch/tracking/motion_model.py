@@ -89,7 +89,7 @@ class MotionModel:
             return
         elapsed = stamp - poses.stamp
         if pose.status is TrackingStatus.LOST or pose.is_relocalised:
-            last = self.velocity * (stamp - poses.last_localised < MAX_EXTRAPOLATION)
+            last = self.velocity * (stamp - poses.last_found < MAX_EXTRAPOLATION)
             self.velocity = motion.velocity if motion.is_measured else last
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:
             self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / max(elapsed, MIN_INTERVAL)

@@ -21,7 +21,7 @@ class PoseHistory:
     """Poses of all frames in the order of time.
 
     Attributes:
-        last_localised: Time of the last frame that was found, seconds; minus infinity if there is none.
+        last_found: Time of the last frame that was found, seconds; minus infinity if there is none.
         observed_landmarks: IDs of the landmarks of the last frame that observed landmarks, int64, shape :math:`(L,)`.
     """
 
@@ -34,7 +34,7 @@ class PoseHistory:
             is_motion_measured=((), torch.bool),  # true if the motion since the previous frame was measured
         )
         self._keyframes: dict[int, Keyframe] = {}  # to which poses are relative, by index
-        self.last_localised = -torch.inf
+        self.last_found = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
         self._place: Keyframe | None = None  # to which the last frame that observed landmarks is relative
 
@@ -71,10 +71,10 @@ class PoseHistory:
         return self._keyframe_of(-1) if len(self) else None
 
     @property
-    def is_located(self) -> bool:
+    def is_localised(self) -> bool:
         """True if the pose of the last frame is known relative to the whole map; False before the first."""
         status, keyframe = self.status, self.keyframe
-        return status is not None and status.is_located and not (keyframe is not None and keyframe.is_disconnected)
+        return status is not None and status.is_localised and not (keyframe is not None and keyframe.is_disconnected)
 
     @property
     def part(self) -> int:
@@ -87,9 +87,9 @@ class PoseHistory:
         return bool(len(self) and self._frames["is_motion_measured"][-1])
 
     @property
-    def is_localised(self) -> bool:
+    def was_found(self) -> bool:
         """True if any frame was found so far."""
-        return self.last_localised > -torch.inf
+        return self.last_found > -torch.inf
 
     def append(
         self, stamp: float, pose: FramePose, motion: CameraMotion, reference: Keyframe | None, new: Keyframe | None
@@ -118,7 +118,7 @@ class PoseHistory:
             correction = torch.eye(4, dtype=torch.float64)  # a new part of the map starts at the predicted pose
             if is_found:
                 correction = orthonormalise(invert(pose.T_cw) @ (motion.T_cp @ self.T_cw))
-            first = is_found and not self.is_localised
+            first = is_found and not self.was_found
             self._correct_lost(correction, keyframe, motion.is_measured, move_all=first)
             T_new_old = correction if first else None
         if new is None:
@@ -136,7 +136,7 @@ class PoseHistory:
             is_motion_measured=torch.tensor([motion.is_measured]),
         )
         if status is not TrackingStatus.LOST:
-            self.last_localised = stamp
+            self.last_found = stamp
         return T_new_old
 
     def replace_last(self, T_cw: Tensor) -> None:
@@ -167,7 +167,7 @@ class PoseHistory:
         return {
             "frames": self._frames,
             "keyframes": self._keyframes,
-            "last_localised": self.last_localised,
+            "last_found": self.last_found,
             "observed_landmarks": self.observed_landmarks,
             "place": self._place,
         }
@@ -175,7 +175,7 @@ class PoseHistory:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the poses of `state_dict`."""
         self._frames, self._keyframes = state["frames"], state["keyframes"]
-        self.last_localised = state["last_localised"]
+        self.last_found = state["last_found"]
         self.observed_landmarks, self._place = state["observed_landmarks"], state["place"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:

@@ -37,7 +37,7 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
     """
     sequence, record = pipeline.sequence, pipeline.record
     poses = pipeline.slam.poses
-    groundtruth = sequence.groundtruth if poses.is_localised else None  # lost poses cannot be aligned to it
+    groundtruth = sequence.groundtruth if poses.was_found else None  # lost poses cannot be aligned to it
     save_trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", sequence.name, poses.statuses)
     if record.snapshots:
         images = [snapshot.frame.image for snapshot in record.snapshots]

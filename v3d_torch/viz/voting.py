@@ -72,9 +72,9 @@ def draw_voting(
     axes = figure.add_subplot()
     axes.axis("off")
     draw_objects(axes, image, list(objects.values()))
-    located = [pair for pair in vote_pairs if centres.keys() >= set(pair)]
+    with_position = [pair for pair in vote_pairs if centres.keys() >= set(pair)]
     dynamic = [id_ for id_, (_, _, motion_state) in objects.items() if motion_state == "dynamic"]
-    effective, ineffective = split_votes(located, dynamic)
+    effective, ineffective = split_votes(with_position, dynamic)
     for pairs, linewidth, rim, alpha in ((ineffective, 0.7, 0.7, 0.5), (effective, 2.0, 3.4, 1.0)):
         lines = [[tuple(centres[id_].tolist()) for id_ in pair] for pair in pairs]
         effects = [Stroke(linewidth=rim, foreground="white"), Normal()]

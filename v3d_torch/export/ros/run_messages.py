@@ -106,7 +106,7 @@ class RunMessages:
             slam: System after at least one frame.
             point_map: Map of the static scene.
         """
-        if not slam.poses.is_localised:
+        if not slam.poses.was_found:
             return
         stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), frames.map_frame(slam.T_lw)
         if not torch.equal(T_mw, self._T_mw):

@@ -104,17 +104,17 @@ def _log_boxes(stream: rr.RecordingStream, frame_objects: FrameObjects, up: Tens
 
 
 def _log_votes(stream: rr.RecordingStream, frame_objects: FrameObjects) -> None:
-    located = {obj.id: obj for obj in frame_objects.objects if bool(obj.centroid.isfinite().all())}
-    positions = {id_: obj.centroid.numpy() for id_, obj in located.items()}
+    with_position = {obj.id: obj for obj in frame_objects.objects if bool(obj.centroid.isfinite().all())}
+    positions = {id_: obj.centroid.numpy() for id_, obj in with_position.items()}
     centroids = rr.Points3D(
         np.array(list(positions.values())).reshape(-1, 3),
-        class_ids=[CLASS_IDS[obj.motion_state] for obj in located.values()],
-        labels=[obj.name for obj in located.values()],
+        class_ids=[CLASS_IDS[obj.motion_state] for obj in with_position.values()],
+        labels=[obj.name for obj in with_position.values()],
         radii=rr.Radius.ui_points(5.0),
     )
     stream.log("world/centroids", centroids)
-    dynamic = [id_ for id_, obj in located.items() if obj.motion_state is MotionState.DYNAMIC]
-    pairs = [pair for pair in frame_objects.vote_pairs if located.keys() >= set(pair)]
+    dynamic = [id_ for id_, obj in with_position.items() if obj.motion_state is MotionState.DYNAMIC]
+    pairs = [pair for pair in frame_objects.vote_pairs if with_position.keys() >= set(pair)]
     effective, ineffective = split_votes(pairs, dynamic)
     stream.log("world/votes", _lines(effective, positions, VOTE_COLOUR, 1.5))
     stream.log("world/votes/without_effect", _lines(ineffective, positions, "lightcoral", 0.5))
