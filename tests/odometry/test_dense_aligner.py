@@ -257,3 +257,9 @@ def test_images_of_another_size_than_the_camera_are_rejected(size: tuple[int, in
     camera = replace(LENS, width=size[0], height=size[1])
     with pytest.raises(InputError, match=f"the camera {size[0]} x {size[1]}; give a camera"):
         align_depth(*A, *B, camera)
+
+
+def test_images_of_one_row_are_rejected() -> None:
+    row, camera = torch.rand(1, 1, 32), replace(LENS, width=32, height=1)
+    with pytest.raises(InputError, match=r"^images of 32 x 1 pixels .* at least 2 rows and 2 columns$"):
+        align_depth(row, row, row, row, camera)

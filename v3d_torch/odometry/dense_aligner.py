@@ -114,7 +114,8 @@ def align_depth(
         The motion and its quality; all NaN and not reliable if an image has no contrast or no depth.
 
     Raises:
-        InputError: If the images do not have the size of the camera, or a mask is not bool.
+        InputError: If the images do not have the size of the camera or fewer than 2 rows or columns, or a mask is not
+            bool.
     """
     align = DenseAligner(config or DenseOdometryConfig(), camera)
     alignment: DenseAlignment = align(grey_a, depth_a, grey_b, depth_b, T_ba, static_a, static_b)
@@ -127,11 +128,19 @@ class DenseAligner(torch.nn.Module):
     Args:
         config: Pyramid levels, noise, limits of the quality.
         camera: Camera of both views, with lens distortion. Levels with fewer than 2 rows or columns are skipped.
+
+    Raises:
+        InputError: If images have fewer than 2 rows or columns.
     """
 
     def __init__(self, config: DenseOdometryConfig, camera: PinholeCamera) -> None:
         super().__init__()
         size = min(camera.width, camera.height)
+        if size < 2:
+            raise InputError(
+                f"images of {camera.width} x {camera.height} pixels have no gradients along both axes; dense alignment"
+                " needs at least 2 rows and 2 columns"
+            )
         self._config, self._size = config, (camera.height, camera.width)
         self._halvings = tuple(halvings for halvings in config.halvings if size >= 2 << halvings) or (0,)
         self._cameras = {halvings: LevelCamera.from_camera(camera, halvings) for halvings in self._halvings}
