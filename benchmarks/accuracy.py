@@ -46,6 +46,11 @@ CONFIGURATIONS = {
 }
 
 
+PEER_RATE = 0.5
+"""Speed at which ORB-SLAM3 gets the frames, relative to that of the recording, so that its mapping threads are not
+late on a slow processor."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Outcome of one run.
@@ -98,8 +103,9 @@ def run(sequence: str, configuration: str, seed: int, data_root: Path) -> Outcom
 def run_peer(sequence: str, peer: str, turn: int, data_root: Path, vocabulary: Path | None) -> Outcome:
     """Run another system once on the same frames and score it in the same way."""
     try:
-        measured = measure(peer, locate_sequence(sequence, data_root), data_root, vocabulary=vocabulary)
-        truth = load_sequence(locate_sequence(sequence, data_root), data_root=data_root).groundtruth
+        source = locate_sequence(sequence, data_root)
+        measured = measure(peer, source, data_root, vocabulary=vocabulary, rate=PEER_RATE)
+        truth = load_sequence(source, data_root=data_root).groundtruth
     except (SystemRunError, V3DError) as error:
         return Outcome(sequence, peer, turn, None, str(error))
     poses = 0 if measured.trajectory is None else len(measured.trajectory)

@@ -23,6 +23,7 @@ KEYFRAMES = {
 
 CONSISTENCY = {
     "sequence": "sequence",
+    "configuration": "configuration",
     "poses": "poses",
     "nees": "NEES, expected 6",
     "bounds": "95% bounds of NEES",

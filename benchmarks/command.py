@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from heading import make_heading
@@ -92,6 +93,6 @@ def publish(
             write_text(options.out, text)
         if options.save:
             for name, measurement in measurements.items():
-                save(name, measurement)
+                save(name, replace(measurement, heading=measurement.heading.until_now()))
     except OutputError as error:
         parser.error(str(error))

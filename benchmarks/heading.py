@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,6 +36,11 @@ class Heading:
     date: str
     hardware: str
     versions: str = ""
+
+    def until_now(self) -> Heading:
+        """Name both commits if the checkout has changed since the start: each run imports the package anew."""
+        commit = current_commit()
+        return self if commit == self.commit else replace(self, commit=f"{self.commit} to {commit}")
 
     def lines(self) -> Iterator[str]:
         """Yield the heading as lines of Markdown."""

@@ -79,6 +79,7 @@ def run_case(sequence: RGBDSequence, case: Case, config: Config, masks: Path | N
     segment = NoSegmentation() if masks is None else InterruptedMasks(sequence, case, masks)
     slam = V3DSLAM(sequence.camera, segment, config)
     online = [slam(frame).status for frame in InterruptedFrames(sequence, case)]
+    slam.flush()
     return Result(slam.poses.trajectory().T_wc, online, slam.poses.statuses)
 
 

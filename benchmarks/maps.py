@@ -63,6 +63,7 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
         views.add(keyframe, frame.image, frame.depth, static, *motion)
         masked.add(keyframe, white, frame.depth, static, *motion)
         unmasked.add(keyframe, white, frame.depth, torch.ones_like(static), *motion)
+    slam.flush()
     return slam, views, {"classified as static": masked, "all": unmasked}
 
 

@@ -26,19 +26,23 @@ Error = Callable[[Any], float]
 
 
 class Problems:
-    """Random problems with a fixed seed."""
+    """Random problems with a fixed seed.
+
+    Args:
+        batch: Number of problems, also the seed.
+    """
 
     def __init__(self, batch: int) -> None:
         self.batch = batch
-        self._generator = torch.Generator().manual_seed(batch)
+        self.generator = torch.Generator().manual_seed(batch)
 
     def normal(self, *shape: int) -> Tensor:
         """Normally distributed random numbers, shape (B, *shape)."""
-        return torch.randn(self.batch, *shape, generator=self._generator, dtype=torch.float64)
+        return torch.randn(self.batch, *shape, generator=self.generator, dtype=torch.float64)
 
     def uniform(self, *shape: int) -> Tensor:
         """Random numbers in [0, 1), shape (B, *shape)."""
-        return torch.rand(self.batch, *shape, generator=self._generator, dtype=torch.float64)
+        return torch.rand(self.batch, *shape, generator=self.generator, dtype=torch.float64)
 
     def points(self, count: int) -> Tensor:
         """Points in the camera frame, one to four metres away."""
@@ -244,7 +248,8 @@ def graphs(batch: int) -> tuple[Implementations, Error]:
     """Pose graphs of 30 poses and 45 edges. Error: poses, thousandths."""
     problems = Problems(batch)
     T_wc = se3_exp(problems.normal(30, 6))
-    edges = torch.cat([torch.stack([torch.arange(29), torch.arange(1, 30)], 1), torch.randint(0, 15, (16, 2))])
+    loops = torch.randint(0, 15, (16, 2), generator=problems.generator)
+    edges = torch.cat([torch.stack([torch.arange(29), torch.arange(1, 30)], 1), loops])
     edges[29:, 1] += 15
     i, j = edges.unbind(1)
     T_ij = invert(T_wc[:, i]) @ T_wc[:, j] @ se3_exp(0.01 * problems.normal(45, 6))

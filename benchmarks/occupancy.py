@@ -163,11 +163,11 @@ def octomap_time(pipeline: Pipeline, mapper: OccupancyMapper) -> str:
     config, store = mapper.map.config, mapper.state_dict()["store"]
     tree = octomap.OcTree(config.voxel_size)
     seconds = 0.0
-    for view, T_cw in zip(store["views"], store["T_cw"], strict=True):
-        rays, depth, T_wc = view.rays(pipeline.sequence.camera, config.stride), view.depth, invert(T_cw)
+    for view, T_dw in zip(store["views"], store["T_dw"], strict=True):
+        rays, depth, T_wd = view.rays(pipeline.sequence.camera, config.stride), view.depth, invert(T_dw)
         valid = (depth > 0) & (depth <= config.max_depth) & view.static
-        points = (rays[valid] * depth[valid][:, None]).to(torch.float64) @ T_wc[:3, :3].T + T_wc[:3, 3]
-        insert = partial(tree.insertPointCloud, points.numpy(), T_wc[:3, 3].numpy(), lazy_eval=True)
+        points = (rays[valid] * depth[valid][:, None]).to(torch.float64) @ T_wd[:3, :3].T + T_wd[:3, 3]
+        insert = partial(tree.insertPointCloud, points.numpy(), T_wd[:3, 3].numpy(), lazy_eval=True)
         seconds += timed(insert, time.process_time)[0]
     return f"{1e3 * seconds / len(store['views']) / config.interval:.2f}"
 

@@ -283,7 +283,7 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 " better. ID switches in 60 frames in which a person is in view, lower is better. People's pixels in"
                 " the right track: fraction of the true pixels of people that lie in the one track of this person."
                 " ByteTrack, OC-SORT and BoT-SORT are those of the package `trackers`, with the same detections; the"
-                " better of two settings is shown. The best HOTA and IDF1 of a sequence are bold."
+                " best of three settings is shown. The best HOTA and IDF1 of a sequence are bold."
             ),
             tracks_table,
             key="sequence",
@@ -367,7 +367,8 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 " Implementations without batches solve the problems one after the other. Our RANSACs take their"
                 " samples from OpenCV's USAC and refine the result. Factor graphs of GTSAM and theseus are built"
                 " beforehand, outside of the time. Errors are medians over the batch: of poses, millimetres and"
-                " milliradians in one number; of essential matrices, thousandths of their norm; of matches, the"
+                " milliradians in one number; of `bundle_adjust`, millimetres of positions, aligned with their scale,"
+                " which pixels do not determine; of essential matrices, thousandths of their norm; of matches, the"
                 " percentage that is missing; of gradients, the difference to ours, %; of `umeyama`, the difference to"
                 " evo, thousandths. A problem that kornia-rs's bundle adjustment cannot solve keeps its initial poses:"
                 " one of the batch of 8, none of the other batches."

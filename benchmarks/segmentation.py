@@ -90,6 +90,7 @@ def compare(sequence: RGBDSequence) -> Iterator[Row]:
         run = pipeline()
         if run.failure is not None:
             raise RuntimeError(run.failure)
+        pipeline.flush()
         reference = reference or segmenter.people
         found = sum(int((people & reference[index]).sum()) for index, people in segmenter.people.items())
         expected = sum(int(reference[index].sum()) for index in segmenter.people)

@@ -78,6 +78,8 @@ def load(name: str, folder: Path = RESULTS) -> list[Measurement]:
 def save(name: str, measurement: Measurement, folder: Path = RESULTS) -> None:
     """Add a measurement to the file of a benchmark, and remove older rows with the same keys.
 
+    The notes of a measurement that loses rows are removed, because they may describe these rows.
+
     Raises:
         OutputError: If the file cannot be written.
     """
@@ -86,7 +88,7 @@ def save(name: str, measurement: Measurement, folder: Path = RESULTS) -> None:
     for older in load(name, folder):
         rows = [row for row in older.rows if key_of(name, row) not in measured]
         if rows:
-            kept.append(Measurement(older.heading, rows, older.notes))
+            kept.append(Measurement(older.heading, rows, older.notes if len(rows) == len(older.rows) else ()))
     folder.mkdir(exist_ok=True)
     entries = [asdict(entry) for entry in [*kept, measurement]]
     write_text(folder / f"{name}.json", json.dumps(entries, indent=1, ensure_ascii=False) + "\n")

@@ -14,11 +14,17 @@ PEERS = ("ByteTrack", "OC-SORT", "BoT-SORT")
 
 SETTINGS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
     "defaults": {name: {} for name in PEERS},
-    # The network of this package returns detections from a score of 0.25 on.
+    # The network of this package returns detections from a score of 0.25 on. Between two thresholds, detections only
+    # continue tracks.
     "low scores": {
         "ByteTrack": {"high_conf_det_threshold": 0.4, "track_activation_threshold": 0.4},
         "OC-SORT": {"high_conf_det_threshold": 0.25},
         "BoT-SORT": {"high_conf_det_threshold": 0.4, "track_activation_threshold": 0.4},
+    },
+    "all scores": {
+        "ByteTrack": {"high_conf_det_threshold": 0.25, "track_activation_threshold": 0.25},
+        "OC-SORT": {"high_conf_det_threshold": 0.25},
+        "BoT-SORT": {"high_conf_det_threshold": 0.25, "track_activation_threshold": 0.25},
     },
 }
 """Settings of each tracker in addition to its defaults; the benchmark shows the best setting for each sequence."""

@@ -20,7 +20,7 @@ from v3d_torch.errors import V3DError
 from v3d_torch.runtime.imports import quick_imports
 
 
-def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None) -> System:
+def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | None, rate: float | None) -> System:
     """Load a system and only its own libraries."""
     if name in OURS:
         with quick_imports():  # as v3d_torch/cli/run.py
@@ -30,7 +30,7 @@ def prepare(name: str, sequence: RGBDSequence, seed: int, vocabulary: Path | Non
     if name == "pyorbslam3":
         from systems.orbslam3 import OrbSlam3
 
-        return OrbSlam3(sequence, vocabulary)
+        return OrbSlam3(sequence, vocabulary, rate)
     from systems.open3d_odometry import Open3DOdometry
 
     return Open3DOdometry(sequence)
@@ -53,13 +53,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--vocabulary", type=Path)
+    parser.add_argument("--rate", type=float)
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
 
     sequence = load_sequence(options.seq, data_root=options.data_root)
     if options.frames is not None and options.frames < len(sequence):
         sequence = Replay(sequence, range(options.frames))
-    system = prepare(options.system, sequence, options.seed, options.vocabulary)
+    system = prepare(options.system, sequence, options.seed, options.vocabulary, options.rate)
     start, cpu_start = time.perf_counter(), cpu_time()
     system()
     seconds, cpu_seconds = time.perf_counter() - start, cpu_time() - cpu_start

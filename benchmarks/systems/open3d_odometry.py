@@ -17,6 +17,9 @@ from open3d.t.pipelines.odometry import Method, rgbd_odometry_multi_scale
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.types import RGBDFrame, Trajectory
 
+MAX_DEPTH = 8.0
+"""Maximum depth that is used, metres, the same as in this package; that of Open3D, 3 m, leaves out most of a room."""
+
 
 class Open3DOdometry:
     """System with the RGB-D odometry of Open3D.
@@ -56,7 +59,8 @@ class Open3DOdometry:
         The previous motion as initial value is more accurate for a moving camera, but can diverge for one at rest.
         """
         try:
-            result = rgbd_odometry_multi_scale(source, target, self._K, depth_scale=1.0, method=Method.Hybrid)
+            options = {"depth_scale": 1.0, "depth_max": MAX_DEPTH, "method": Method.Hybrid}
+            result = rgbd_odometry_multi_scale(source, target, self._K, **options)
         except RuntimeError:  # too little depth, or no overlap
             return torch.eye(4, dtype=torch.float64)
         return torch.from_numpy(result.transformation.numpy().copy())

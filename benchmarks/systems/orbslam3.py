@@ -1,6 +1,6 @@
 """ORB-SLAM3 (Campos et al., T-RO 2021) with RGB-D images, as the PyPI package pyorbslam3 builds it.
 
-It runs at full speed, without a window. It is not deterministic, because of its threads.
+It runs without a window. It is not deterministic, because of its threads.
 """
 
 from __future__ import annotations
@@ -34,12 +34,15 @@ class OrbSlam3:
     Args:
         sequence: Sequence to run on.
         vocabulary: Vocabulary in DBoW2's text format.
+        rate: Speed at which frames are given, relative to that of the recording: its mapping threads need time between
+            the frames. None for full speed.
     """
 
     stages: Mapping[str, float] = {}
 
-    def __init__(self, sequence: RGBDSequence, vocabulary: Path) -> None:
+    def __init__(self, sequence: RGBDSequence, vocabulary: Path, rate: float | None = None) -> None:
         self._sequence = sequence
+        self._rate = rate
         with TemporaryDirectory() as folder:
             path = Path(folder) / "settings.yaml"
             path.write_text(settings(sequence.camera, frame_rate(sequence)))
@@ -47,7 +50,10 @@ class OrbSlam3:
 
     def __call__(self) -> None:
         """Track all frames. The call does not wait for the mapping threads."""
+        start, first = time.monotonic(), float(self._sequence.stamps[0])
         for frame in self._sequence:
+            if self._rate is not None:
+                time.sleep(max(start + (frame.stamp - first) / self._rate - time.monotonic(), 0.0))
             self._slam.track_rgbd(frame.image.permute(1, 2, 0).numpy(), frame.depth[0].numpy(), frame.stamp)
 
     def trajectory(self) -> Trajectory:

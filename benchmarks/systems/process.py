@@ -49,6 +49,7 @@ def measure(
     frames: int | None = None,
     seed: int = 0,
     vocabulary: Path | None = None,
+    rate: float | None = None,
 ) -> Measured:
     """Run a system on the first frames of a sequence.
 
@@ -59,11 +60,12 @@ def measure(
         frames: Number of frames; None for all.
         seed: Seed, for systems that have one.
         vocabulary: Vocabulary of ORB-SLAM3.
+        rate: Speed at which ORB-SLAM3 gets the frames, relative to that of the recording; None for full speed.
 
     Raises:
         SystemRunError: If the system failed, crashed or hung.
     """
-    options = {"--frames": frames, "--vocabulary": vocabulary, "--seed": seed, "--data-root": data_root}
+    options = {"--frames": frames, "--vocabulary": vocabulary, "--rate": rate, "--seed": seed, "--data-root": data_root}
     given = [word for name, value in options.items() if value is not None for word in (name, str(value))]
     here = str(Path(__file__).parent.parent)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}

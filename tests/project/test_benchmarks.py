@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -15,7 +16,9 @@ import torch
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.pipeline import Pipeline
 from v3d_torch.segmentation.coco import PERSON
+from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -24,6 +27,8 @@ import accuracy
 import degraded
 import descriptions
 import growth
+import heading
+import occupancy
 import segmentation
 import speed
 import storage
@@ -100,6 +105,15 @@ class TestReplay:
         replay = Replay(sequence, range(2))
         assert [frame.index for frame in replay] == [0, 1]
         assert torch.allclose(replay.stamps, sequence.stamps[:2], atol=1e-6, rtol=0)
+
+    def test_replayed_frame_has_the_depth_delay_and_gravity_of_the_sequence(self, moment: Path) -> None:
+        camera = replace(load_sequence(str(moment)).camera, inverse_depth_offset=0.01)
+        sequence = load_sequence(str(moment), camera=camera)
+        gravity = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)
+        sequence.gravity, sequence._depth_delays = gravity, [0.012] * len(sequence)
+        frame = Replay(sequence, range(3))[0]
+        assert torch.equal(frame.depth, sequence[0].depth) and frame.depth_delay == 0.012
+        assert frame.gravity is not None and torch.equal(frame.gravity, gravity) and frame.camera == camera
 
 
 class TestSegmentation:
@@ -248,6 +262,16 @@ def test_pose_graph_closes_drifting_ring() -> None:
     assert int(cells["iterations"]) > 0 and float(cells["error_after"]) < float(cells["error_before"])
 
 
+def test_costs_of_an_occupancy_map_are_measured_beside_octomap(moment: Path) -> None:
+    sequence = load_sequence(str(moment))
+    config = load_config(overrides=["segmentation.source=none", "occupancy.enabled=true", "occupancy.interval=1"])
+    pipeline = Pipeline(sequence, V3DSLAM(sequence.camera, config=config))
+    pipeline()
+    assert pipeline.slam.occupancy is not None
+    row = occupancy.measure_costs(pipeline, pipeline.slam.occupancy)
+    assert float(row["octomap_ms"]) > 0 and float(row["cpu_ms"]) > 0 and float(row["memory_mb"]) > 0
+
+
 def test_our_systems_have_options() -> None:
     from systems.ours import OPTIONS
 
@@ -289,14 +313,27 @@ class TestPage:
 
     def test_newer_row_replaces_older_row_with_same_keys(self, tmp_path: Path) -> None:
         for commit, rows in (("a", {"500": "1", "900": "2"}), ("b", {"500": "3"}), ("c", {"900": "4"})):
-            heading = Heading("", commit, "2026-01-02", "2 cores")
             cells = [{"keyframes": count, "query_ms": value} for count, value in rows.items()]
-            storage.save("keyframes", storage.Measurement(heading, cells, [commit]), tmp_path)
+            of_commit = Heading("", commit, "2026-01-02", "2 cores")
+            storage.save("keyframes", storage.Measurement(of_commit, cells, [commit]), tmp_path)
         stored = storage.load("keyframes", tmp_path)
         assert [(measured.heading.commit, list(measured.rows)) for measured in stored] == [
             ("b", [{"keyframes": "500", "query_ms": "3"}]),
             ("c", [{"keyframes": "900", "query_ms": "4"}]),
         ]
+
+    def test_notes_of_a_measurement_that_lost_rows_are_removed(self, tmp_path: Path) -> None:
+        for counts in ((500, 900), (700,), (500,)):
+            rows = [{"keyframes": str(count)} for count in counts]
+            storage.save("keyframes", storage.Measurement(self.HEADING, rows, [f"of {counts}"]), tmp_path)
+        notes = [list(measured.notes) for measured in storage.load("keyframes", tmp_path)]
+        assert notes == [[], ["of (700,)"], ["of (500,)"]]
+
+    def test_heading_names_both_commits_if_the_checkout_changes(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        started = heading.make_heading()
+        assert started.until_now() == started
+        monkeypatch.setattr(heading, "current_commit", lambda: "abc1234-dirty")
+        assert started.until_now().commit == f"{started.commit} to abc1234-dirty"
 
     def test_every_stored_row_has_its_keys_once(self) -> None:
         for path in storage.RESULTS.glob("*.json"):
