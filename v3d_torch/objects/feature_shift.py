@@ -2,8 +2,8 @@
 
 Features on a static object are where the camera motion moves them, up to noise. Those on a moving object are displaced,
 all in the same direction. In one frame a slow motion is smaller than the noise, but within some tenths of a second the
-displacements add up. The displacements of other parts of the image, which stand still, show how much of a sum is due to
-errors of the camera motion, of the depth and of the rolling shutter.
+displacements add up. The displacements of other parts of the image, which stand still, are added up in the same way.
+They show how much of a sum is due to errors of the camera motion, of the depth and of the rolling shutter.
 """
 
 from __future__ import annotations
@@ -51,24 +51,36 @@ class FeatureShift:
     Attributes:
         pixels: Median displacement, along u and v, pixels.
         variance: Variance of its noise, of both axes together, square pixels.
-        elsewhere: Displacement of nearly all other places of the image, pixels; infinite if it is not known.
+        elsewhere: Median displacement in each cell of the image outside of all objects, along u and v, pixels,
+            float64, shape :math:`(C, 2)`; NaN for cells with too few features.
     """
 
     pixels: tuple[float, float]
     variance: float
-    elsewhere: float
+    elsewhere: Tensor
 
     @property
     def is_motion(self) -> bool:
-        """True if the object has moved: it is displaced significantly more than other places."""
-        return math.hypot(*self.pixels) > self.elsewhere + _MIN_SIGMAS * max(math.sqrt(self.variance), _MIN_SIGMA)
+        """True if the object has moved: it is displaced significantly more than nearly all other places."""
+        beyond = math.hypot(*self.pixels) - _MIN_SIGMAS * max(math.sqrt(self.variance), _MIN_SIGMA)
+        return beyond > 0 and beyond > self._displacement_elsewhere
+
+    @property
+    def _displacement_elsewhere(self) -> float:
+        """Displacement of nearly all other places, pixels; infinite if too few are known."""
+        displacement = self.elsewhere.norm(dim=1)
+        known = displacement[displacement.isfinite()]
+        return float(known.quantile(_QUANTILE)) if len(known) >= _MIN_CELLS else math.inf
 
 
 def sum_shifts(shifts: Iterable[FeatureShift]) -> FeatureShift:
-    """Add up the shifts of consecutive frames. Noise is independent, displacements elsewhere have one direction."""
+    """Add up the shifts of consecutive frames, whose noise is independent.
+
+    A cell that is not known in some of the frames has its mean displacement there.
+    """
     pixels, variances, elsewhere = zip(*((each.pixels, each.variance, each.elsewhere) for each in shifts), strict=True)
     u, v = zip(*pixels, strict=True)
-    return FeatureShift((sum(u), sum(v)), sum(variances), sum(elsewhere))
+    return FeatureShift((sum(u), sum(v)), sum(variances), len(elsewhere) * torch.stack(elsewhere).nanmean(dim=0))
 
 
 def feature_shifts(pixel: Tensor, residuals: Tensor, masks: Sequence[Tensor]) -> list[FeatureShift | None]:
@@ -93,7 +105,7 @@ def feature_shifts(pixel: Tensor, residuals: Tensor, masks: Sequence[Tensor]) ->
     (u, v), (height, width) = pixel.T, masks[0].shape
     cell = (v * _GRID[0] // height * _GRID[1] + u * _GRID[1] // width).numpy()
     outside = ~inside.any(axis=0)
-    elsewhere = _displacement_of_cells(displacement[outside], cell[outside])
+    elsewhere = _displacements_of_cells(displacement[outside], cell[outside])
     return [_shift(each, elsewhere) if _is_enough(each := displacement[on_object]) else None for on_object in inside]
 
 
@@ -101,14 +113,14 @@ def _is_enough(displacement: NDArray[np.float64]) -> bool:
     return len(displacement) >= _MIN_FEATURES
 
 
-def _displacement_of_cells(displacement: NDArray[np.float64], cell: NDArray[np.int64]) -> float:
-    """Return the displacement of nearly all cells, pixels; infinite with too few cells."""
+def _displacements_of_cells(displacement: NDArray[np.float64], cell: NDArray[np.int64]) -> Tensor:
+    """Return the median displacement of each cell, shape (C, 2); NaN for cells with too few features."""
     of_cells = (displacement[cell == k] for k in range(_GRID[0] * _GRID[1]))
-    medians = [_median(each) for each in of_cells if _is_enough(each)]
-    return float(np.quantile(np.hypot(*np.transpose(medians)), _QUANTILE)) if len(medians) >= _MIN_CELLS else math.inf
+    medians = [_median(each) if _is_enough(each) else np.full(2, np.nan) for each in of_cells]
+    return torch.from_numpy(np.stack(medians))
 
 
-def _shift(displacement: NDArray[np.float64], elsewhere: float) -> FeatureShift:
+def _shift(displacement: NDArray[np.float64], elsewhere: Tensor) -> FeatureShift:
     median = _median(displacement)
     sigma = _SIGMA_OF_MEDIAN * _median(np.abs(displacement - median))
     return FeatureShift(tuple(median.tolist()), float(np.square(sigma).sum()) / len(displacement), elsewhere)
