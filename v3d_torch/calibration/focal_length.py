@@ -14,18 +14,19 @@ _MIN_KEYFRAMES, _MAX_KEYFRAMES = 5, 12
 """Minimum and maximum number of keyframes in the bundle adjustment."""
 
 _MIN_CHANGE = 0.1
-"""Minimum relative error of the given focal lengths: those of cameras of one model differ by a fifth of it, and lens
-distortion that is not modelled changes the estimate by half of it."""
+"""Minimum relative error of the given focal lengths: those of cameras of one model differ by a fifth of it."""
 
-_SUSPICION = 0.5
-"""Fraction of this change above which a first, inaccurate estimate is followed by a more accurate one."""
+_MODEL_ERROR = 0.05
+"""Relative error of an estimate due to lens distortion that is not modelled. A first, inaccurate estimate beyond it is
+followed by a more accurate one."""
 
 _SIGNIFICANCE = 3.0
-"""Number of standard deviations by which an estimate must exceed this change."""
+"""Number of standard deviations by which the change of an estimate must exceed the model error."""
 
 _FACTORS = (0.6, 1.0, 1.7)
-"""Focal lengths relative to the given ones at which the cost is compared. If the given ones are half of the true ones,
-the cost can have another minimum near them: matches that do not fit them have been left out of the map."""
+"""Focal lengths relative to the given ones from which the minimum is searched. In a map that was built with wrong focal
+lengths, the cost can have another minimum near these, or decrease without end towards long ones: matches that do not
+fit have been left out of the map."""
 
 
 def better_focal_lengths(tables: MapTables, camera: PinholeCamera, config: Config) -> tuple[float, float] | None:
@@ -52,13 +53,13 @@ def better_focal_lengths(tables: MapTables, camera: PinholeCamera, config: Confi
     best = min(range(len(tried)), key=lambda index: float(tried[index].cost))
     at = problem.differentiate(names, given * scales[best], tried[best])
     step = torch.linalg.pinv(at.hessian.sum(dim=0), hermitian=True) @ at.gradient.sum(dim=0)
-    if not bool(((scales[best] - step / given - 1).abs()[:2] > _SUSPICION * _MIN_CHANGE).any()):
+    if not bool(((scales[best] - step / given - 1).abs()[:2] > _MODEL_ERROR).any()):
         return None
-    starts = [given] if bool((scales[best] == 1).all()) else [given, given * scales[best]]
-    minima = [problem.minimise(names, start) for start in starts]
+    minima = [problem.minimise(names, given * scale) for scale in scales]
     values, at = min(minima, key=lambda found: float(problem.adjust(names, found[0], *found[1][:2]).cost))
     sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
-    change = (values / given).log().abs() - _SIGNIFICANCE * sigma / values
-    if not bool((change[:2] > _MIN_CHANGE).any()):
+    change = (values / given).log().abs()
+    needed = (_MODEL_ERROR + _SIGNIFICANCE * sigma / values).clamp(min=_MIN_CHANGE)
+    if not bool((change > needed)[:2].any()):
         return None
     return float(values[0]), float(values[1])

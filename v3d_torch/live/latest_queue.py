@@ -7,6 +7,9 @@ from typing import Generic, TypeVar
 
 _T = TypeVar("_T")
 
+_INTERRUPTIBLE_WAIT = 0.2
+"""Longest time of one wait, seconds: on Windows, Ctrl-C does not interrupt a wait without an end."""
+
 
 class LatestQueue(Generic[_T]):
     """Queue in which a new item replaces an item that was not taken yet, except the first item of all.
@@ -40,7 +43,8 @@ class LatestQueue(Generic[_T]):
             BaseException: The error with which the queue was closed, after its last item was taken.
         """
         with self._changed:
-            self._changed.wait_for(lambda: self._items or self._is_closed)
+            while not self._changed.wait_for(lambda: self._items or self._is_closed, timeout=_INTERRUPTIBLE_WAIT):
+                pass
             if self._items:
                 self._is_first_waiting = False
                 return self._items.pop(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -68,8 +69,7 @@ def _ensure_viewer(port: int) -> None:
     if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAY_VARIABLES):
         raise ViewerError(f"--viz rerun: no screen to open a viewer on; {alternatives}")
     # In an environment that is not activated, the program is not on the path, but beside the interpreter.
-    local_program = Path(sys.executable).with_name("rerun")
-    program = str(local_program) if local_program.is_file() else "rerun"
+    program = shutil.which("rerun", path=Path(sys.executable).parent) or "rerun"  # rerun.exe on Windows
     # Not rerun.spawn, because its viewer accepts connections from the whole network.
     arguments = [f"--port={port}", "--bind=127.0.0.1", "--expect-data-soon"]
     try:
