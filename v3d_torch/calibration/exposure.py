@@ -9,7 +9,7 @@ _WHITE = 250
 
 _MAX_WHITE_FRACTION = 1 / 3
 """Largest fraction of white pixels in a well exposed image: windows and lamps cover up to a tenth of it, a white desk
-near the camera up to 27 %, as in fr1_rpy of TUM."""
+near the camera up to a quarter."""
 
 _MIN_VIEWS = 3
 """Minimum number of overexposed views, for a warning: a lamp or window can fill a single view."""

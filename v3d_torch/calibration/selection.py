@@ -33,8 +33,8 @@ _FOCAL_ERROR = 0.015
 model, the readout is not constant, depth has errors. It is that of recordings whose focal lengths are known."""
 
 _CENTRE_ERROR = 0.005
-"""Standard deviation of the principal point by the same causes, relative to the width of the image. It is that of one
-recording, fr1_rpy of TUM, whose published principal point differs by this from the estimate."""
+"""Standard deviation of the principal point by the same causes, relative to the width of the image: that of published
+principal points."""
 
 _LONG_BLOCKS = MAX_BLOCKS // 2
 """Number of the longer blocks with which standard deviations are compared."""

@@ -64,7 +64,7 @@ class ConfigChoice:
         """
         config = load_config(find_config(FULL if self.name is None else self.name), self.overrides)
         for option, override in self.options.items():
-            changed = override_config(config, [override])
+            changed = override_config(config, [override], source=option)
             if changed != config:
                 for other in self.overrides:
                     if _key(other) == _key(override):

@@ -76,15 +76,24 @@ def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> C
     return _apply_overrides(tree, _validate(tree, f"{name}"), overrides)
 
 
-def override_config(config: Config, overrides: Iterable[str]) -> Config:
-    """Return a copy of a configuration with overrides, which are parsed and checked as in `load_config`."""
-    return _apply_overrides(config.model_dump(), config, overrides)
+def override_config(config: Config, overrides: Iterable[str], source: str = "--set") -> Config:
+    """Return a copy of a configuration with overrides, which are parsed and checked as in `load_config`.
+
+    Args:
+        config: Configuration.
+        overrides: Values to set, such as ``seed=3``.
+        source: Option that sets them, for messages.
+
+    Raises:
+        ConfigError: If a key or a value is not valid.
+    """
+    return _apply_overrides(config.model_dump(), config, overrides, source)
 
 
-def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[str]) -> Config:
+def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[str], source: str = "--set") -> Config:
     for override in [overrides] if isinstance(overrides, str) else overrides:  # a string is an iterable, too
         _apply_override(tree, override)
-        config = _validate(tree, "--set")
+        config = _validate(tree, source)
     return config
 
 

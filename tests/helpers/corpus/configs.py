@@ -297,19 +297,19 @@ CASES = [
     Case(
         "negative --seed",
         add_options("--seed", "-1"),
-        Fails("--set: seed: input should be greater than or equal to 0, got -1"),
+        Fails("--seed -1: seed: input should be greater than or equal to 0, got -1"),
     ),
     Case(
         "unknown --segmenter",
         add_options("--segmenter", "sam"),
-        Fails("--set: segmentation.source: input should be 'yolo', 'masks' or 'none', got 'sam'"),
+        Fails("--segmenter sam: segmentation.source: input should be 'yolo', 'masks' or 'none', got 'sam'"),
     ),
     Case(
         "unknown --model",
         add_options("--model", "yolov8x-seg"),
         Fails(
-            "--set: segmentation.model: input should be 'yolov8n-seg', 'yolo11n-seg' or 'yolo26n-seg', got"
-            " 'yolov8x-seg'"
+            "--model yolov8x-seg: segmentation.model: input should be 'yolov8n-seg', 'yolo11n-seg' or 'yolo26n-seg',"
+            " got 'yolov8x-seg'"
         ),
     ),
 ]
