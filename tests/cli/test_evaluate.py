@@ -15,7 +15,7 @@ from helpers.commands import invoke
 
 from v3d_torch.cli.evaluate import app, main
 from v3d_torch.datasets.tum_extents import EXTENTS
-from v3d_torch.datasets.tum_trajectory import write_trajectory
+from v3d_torch.datasets.tum_trajectory import read_trajectory, write_trajectory
 from v3d_torch.evaluation import evaluate
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.types import Trajectory
@@ -84,6 +84,15 @@ def test_part_of_a_sequence_is_marked_in_the_papers_table(count: int, label: str
 
 def test_unit_of_rpe_contains_other_delta(files: tuple[str, str]) -> None:
     assert "RPE, m/0.5 s" in call(*files, "--delta", "0.5").stdout
+
+
+def test_poses_within_the_maximum_difference_are_compared(files: tuple[str, str]) -> None:
+    for path, delay in zip(files, (0.0, 0.05), strict=True):
+        poses = read_trajectory(path)
+        write_trajectory(Path(path), Trajectory(poses.stamps[::6] + delay, poses.T_wc[::6]))  # 0.2 s apart
+    apart = call(*files)
+    assert apart.exit_code == 2 and "estimate.txt" in apart.stderr
+    assert "15 of 15 poses have ground truth" in call(*files, "--max-difference", "0.06").stdout
 
 
 def test_notes_are_printed(files: tuple[str, str]) -> None:

@@ -82,8 +82,13 @@ def is_prose(text: str) -> bool:
     "name", ["fr3/w/xyz@example.org", "../../example.org/a", "https://example.org/a", "fr1/desk?x"]
 )
 def test_sequence_names_cannot_change_the_download_host(name: str) -> None:
+    assert canonical_name(name) is None
+
+
+@pytest.mark.parametrize("name", ["fr3/w/xyz", "fr1/desk", "rgbd_dataset_freiburg2_xyz", "fr3_sitting_rpy"])
+def test_sequences_are_downloaded_from_the_host_of_the_data_set(name: str) -> None:
     full = canonical_name(name)
-    assert full is None or urlsplit(download_url(full)).netloc == "cvg.cit.tum.de"
+    assert full is not None and urlsplit(download_url(full)).netloc == "cvg.cit.tum.de"
 
 
 def test_security_rules_are_enabled_with_known_exceptions() -> None:
