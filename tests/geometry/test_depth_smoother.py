@@ -142,7 +142,7 @@ def test_default_dtype_does_not_change_the_result() -> None:
 
 @pytest.mark.parametrize("kernel_size", [0, 4])
 def test_even_window_is_rejected(kernel_size: int) -> None:
-    with pytest.raises(ConfigError, match="odd"):
+    with pytest.raises(ConfigError, match=rf"kernel_size is {kernel_size}; .*odd"):
         smooth_depth(torch.ones(1, 1, 4, 4), kernel_size)
 
 

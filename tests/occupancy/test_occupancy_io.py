@@ -118,6 +118,7 @@ def test_invalid_arrays_are_rejected(damage: str, room: OccupancyMap, tmp_path: 
 def test_file_with_wrong_bytes_is_rejected_or_gives_the_same_map(room: OccupancyMap, tmp_path: Path) -> None:
     save_occupancy(tmp_path / "room.npz", room, FLOOR)
     content, generator = (tmp_path / "room.npz").read_bytes(), np.random.default_rng(0)
+    intact, rejected = load_occupancy(tmp_path / "room.npz").map, 0
     for _ in range(60):
         damaged = bytearray(content)
         damaged[generator.integers(len(content))] ^= 1 << int(generator.integers(8))
@@ -125,5 +126,10 @@ def test_file_with_wrong_bytes_is_rejected_or_gives_the_same_map(room: Occupancy
         try:
             stored = load_occupancy(tmp_path / "damaged.npz")
         except InputError:
+            rejected += 1
             continue
         assert torch.equal(stored.map.blocks.log_odds, room.blocks.log_odds[room.blocks.rows])
+        assert torch.equal(stored.map.occupied_points, intact.occupied_points) and stored.map.config == room.config
+        assert stored.floor is not None and (stored.floor.offset, stored.floor.area) == (FLOOR.offset, FLOOR.area)
+        assert torch.equal(stored.floor.up, FLOOR.up)
+    assert rejected > 30

@@ -28,6 +28,19 @@ def test_motion_is_correct_with_a_third_of_outliers() -> None:
     assert (motion.pairs[:, 0] >= 270).sum() < 10
 
 
+def test_with_a_prediction_a_limited_number_of_features_is_matched() -> None:
+    a, b, T_ba = two_views()
+    config = Config().odometry.model_copy(update={"max_features": 50})
+    estimate = MotionEstimator(config, Config().features, CAMERA, seed=0)
+    alone, predicted = estimate(a, b), estimate(a, b, initial_guess=T_ba)
+    assert alone is not None and len(alone.pairs) == 400
+    assert predicted is not None and 20 <= len(predicted.pairs) <= 50
+    assert torch.allclose(predicted.T_ba, T_ba, atol=1e-6)
+    extent = a.uv.amax(dim=0) - a.uv.amin(dim=0)
+    matched = a.uv[predicted.pairs[:, 0]]
+    assert bool((matched.amax(dim=0) - matched.amin(dim=0) > 0.8 * extent).all())  # spread over the image
+
+
 def test_motion_is_deterministic() -> None:
     a, b, _ = two_views(outliers=130, noise=0.5)
     estimate = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=7)

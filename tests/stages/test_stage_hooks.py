@@ -17,6 +17,7 @@ from v3d_torch.errors import ConfigError
 from v3d_torch.features.features import Features
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.depth_smoother import DepthSmoother
+from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.newly_occupied import NewlyOccupied
@@ -47,7 +48,7 @@ CALLS: dict[str, tuple[int, type | tuple[type, ...]]] = {
     "track_camera": (6, FramePose),
     "estimate_state": (5, CameraState),
     "refine_previous": (4, type(None)),
-    "mapper": (4, object),
+    "mapper": (4, (Keyframe, type(None))),
 }
 """Number of arguments and type of the result of each stage."""
 
@@ -64,6 +65,7 @@ def test_every_stage_is_seen_with_its_arguments_and_result() -> None:
     for name, args, result in seen:
         count, kind = CALLS[name]
         assert len(args) == count and isinstance(result, kind), name
+    assert any(isinstance(result, Keyframe) for name, _, result in seen if name == "mapper")
     counts = Counter(name for name, _, _ in seen)
     # For the odometry, for the pose in the map, and for each previous frame.
     assert counts.pop("compensate") == 3 * FRAMES - 1

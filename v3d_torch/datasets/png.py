@@ -51,6 +51,8 @@ def _decode_png_compiled(content: bytes, max_pixels: int) -> Pixels:
         filtered = deflate.zlib_decompress(compressed, height * (1 + width * pixel_bytes))
     except deflate.DeflateError as error:
         raise ValueError(str(error)) from error
+    if len(filtered) < height * (1 + width * pixel_bytes):
+        raise ValueError("the image has too few pixels")
     rows = np.frombuffer(filtered, np.uint8).reshape(height, 1 + width * pixel_bytes)
     pixels = np.empty((height, width * pixel_bytes), np.uint8)
     if not kernels.undo_filters(rows, pixel_bytes, pixels):
