@@ -86,6 +86,14 @@ collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
 """Files that need Unix: full disks and little memory are simulated with its resource limits."""
 
 
+@pytest.fixture(autouse=True)
+def seed() -> None:
+    """Seed torch's global generator, so that its numbers do not depend on the tests that ran before."""
+    import torch
+
+    torch.manual_seed(0)
+
+
 @pytest.fixture(scope="session")
 def moment(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of six frames of the demo with true masks, in which the walker is in the middle of the room."""

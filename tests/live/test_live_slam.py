@@ -143,8 +143,7 @@ def test_first_frame_is_tracked_although_later_ones_wait_at_the_start() -> None:
     assert live.slam.gravity is not None and live.slam.gravity.allclose(down)
 
 
-def test_tracking_does_not_wait_for_a_slow_network_on_every_frame() -> None:
-    """With interval 2 the frames between are tracked without the network."""
+def test_every_second_frame_is_segmented_with_interval_2() -> None:
     source, send = feed()
     segmented: list[int] = []
 

@@ -18,6 +18,9 @@ CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=39.5, cy=29.5, width=80, height=60)
 OFFSET = torch.tensor([0.03, 0.0, 0.04], dtype=torch.float64)
 """Error of the tracked position, 5 cm."""
 
+VELOCITY_OFFSET = torch.tensor([0.0, 0.2, 0.0], dtype=torch.float64)
+"""Error of the tracked velocity, m/s."""
+
 
 @pytest.fixture
 def modules(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,12 +45,17 @@ def test_errors_are_those_of_the_track_in_any_world() -> None:
         depth = torch.full((1, 60, 80), 5.0)
         depth[0, torch.from_numpy(owner == 1)] = float(centre[2])
         state = ObjectState(
-            stamp, T_eg[:3, :3] @ (place + OFFSET) + T_eg[:3, 3], T_eg[:3, :3] @ velocity, (0.0025, 0.0, 0.04), 2.0
+            stamp,
+            T_eg[:3, :3] @ (place + OFFSET) + T_eg[:3, 3],
+            T_eg[:3, :3] @ (velocity + VELOCITY_OFFSET),
+            (0.0025, 0.0, 0.04),
+            2.0,
         )
         overlap = scores.FrameOverlap((4,), (9,), np.ones((1, 1)), np.ones((1, 1), np.int64), np.ones(1, np.int64))
         errors.add(people_class(stamp, owner, (4,)), depth, overlap, {9: state}, T_eg @ T)
     found = errors.scores()
     assert found.count == 20
-    assert found.position == pytest.approx(0.05, abs=0.03)  # a pixel is 5 cm
-    assert found.velocity == pytest.approx(0.0, abs=0.12)
-    assert found.position_nees == pytest.approx(1.0, abs=1.0) and found.velocity_nees < 1.0
+    assert found.position == pytest.approx(0.05, abs=0.015)  # a pixel is 5 cm
+    assert found.velocity == pytest.approx(0.2, abs=0.03)
+    assert found.position_nees == pytest.approx(0.05**2 / 0.0025, abs=0.5)
+    assert found.velocity_nees == pytest.approx(0.2**2 / 0.04, abs=0.2)
