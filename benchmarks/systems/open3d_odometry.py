@@ -1,5 +1,7 @@
 """RGB-D odometry of Open3D (Zhou et al., 2018), from each frame to the next, by colour and depth ("hybrid").
 
+It has the defaults of Open3D, which use depth up to 3 m.
+
 Open3D has no complete SLAM system on a CPU, only this odometry.
 """
 
@@ -16,9 +18,6 @@ from open3d.t.pipelines.odometry import Method, rgbd_odometry_multi_scale
 
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.types import RGBDFrame, Trajectory
-
-MAX_DEPTH = 8.0
-"""Maximum depth that is used, metres, the same as in this package; that of Open3D, 3 m, leaves out most of a room."""
 
 
 class Open3DOdometry:
@@ -59,8 +58,7 @@ class Open3DOdometry:
         The previous motion as initial value is more accurate for a moving camera, but can diverge for one at rest.
         """
         try:
-            options = {"depth_scale": 1.0, "depth_max": MAX_DEPTH, "method": Method.Hybrid}
-            result = rgbd_odometry_multi_scale(source, target, self._K, **options)
+            result = rgbd_odometry_multi_scale(source, target, self._K, depth_scale=1.0, method=Method.Hybrid)
         except RuntimeError:  # too little depth, or no overlap
             return torch.eye(4, dtype=torch.float64)
         return torch.from_numpy(result.transformation.numpy().copy())
