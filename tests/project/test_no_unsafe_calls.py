@@ -57,25 +57,15 @@ def test_code_contains_no_other_address() -> None:
     """The only address without https is that of the viewer, on the same machine."""
     hosts = set()
     for name, source in sources():
-        docstrings = {id(node.body[0].value) for node in ast.walk(ast.parse(source)) if has_docstring(node)}
-        for node in ast.walk(ast.parse(source)):
+        nodes = list(ast.walk(ast.parse(source)))
+        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}  # also those of attributes
+        for node in nodes:
             if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
                 for address in re.findall(r"\b[\w+]+://[^\s\"'<>]+", node.value):
-                    if not is_prose(node.value):
-                        hosts.add((urlsplit(address).scheme, urlsplit(address).hostname, name))
+                    hosts.add((urlsplit(address).scheme, urlsplit(address).hostname, name))
     assert {(scheme, host) for scheme, host, _ in hosts} - {("https", host) for host in HOSTS} <= {
         ("rerun+http", "127.0.0.1")
     }, hosts
-
-
-def has_docstring(node: ast.AST) -> bool:
-    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
-    return isinstance(node, kinds) and ast.get_docstring(node) is not None
-
-
-def is_prose(text: str) -> bool:
-    """Check for docstrings, also those of attributes."""
-    return len(text.split()) > 3
 
 
 @pytest.mark.parametrize(
@@ -128,6 +118,18 @@ def test_pickles_are_only_loaded_with_weights_only() -> None:
     ]
     assert sorted(name for name, _ in calls) == ["io/state_file.py", "segmentation/pt_weights.py"]
     assert all("weights_only=True" in call for _, call in calls)
+
+
+def test_functions_that_unpickle_are_not_imported_under_other_names() -> None:
+    for name, source in sources():
+        for node in ast.walk(ast.parse(source)):
+            if isinstance(node, ast.ImportFrom) and node.module in ("torch", "numpy", "joblib", "pickle"):
+                assert not {each.name for each in node.names} & {"load", "loads", "Unpickler"}, name
+            if isinstance(node, ast.Import):
+                renamed = {each.name: each.asname for each in node.names if each.asname}
+                assert renamed.get("numpy", "np") == "np" and not {"torch", "joblib", "pickle"} & renamed.keys(), name
+            if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
+                assert ast.unparse(node.value) == "False", name
 
 
 # --- licences
