@@ -108,6 +108,12 @@ def test_undistorted_bounds_contain_all_undistorted_pixels() -> None:
     assert PinholeCamera(300.0, 300.0, 319.5, 239.5, 640, 480).undistorted_bounds == (0, 0, 640, 480)
 
 
+def test_undistorted_bounds_contain_the_image_of_a_lens_that_shrinks_it() -> None:
+    camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
+    assert camera.undistort(torch.zeros(1, 2)).min() > 4
+    assert camera.undistorted_bounds == (0, 0, 640, 480)
+
+
 @pytest.mark.parametrize(
     ("distortion", "model", "completed", "completed_model"),
     [

@@ -247,14 +247,16 @@ class PinholeCamera:
 
     @cached_property
     def undistorted_bounds(self) -> tuple[float, float, float, float]:
-        """Undistorted pixels that the image covers: minimum u and v, inclusive, and maximum u and v, exclusive.
+        """Extent of the image and its undistorted pixels: minimum u and v, inclusive, and maximum u and v, exclusive.
 
-        The undistorted image of a wide lens is much larger than the recorded image.
+        The undistorted image of a wide lens is much larger than the recorded image. Where it is smaller, predicted
+        positions between the two borders count as in the image, because predictions have errors.
         """
+        width, height = float(self.width), float(self.height)
         if not self.is_distorted:
-            return 0.0, 0.0, float(self.width), float(self.height)
+            return 0.0, 0.0, width, height
         low, high = (self._normalised_bounds * self.focal_lengths + self._principal_point).tolist()
-        return low[0], low[1], high[0], high[1]
+        return min(low[0], 0.0), min(low[1], 0.0), max(high[0], width), max(high[1], height)
 
     def project_to_image(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
         """Project points to distorted pixels and check which of them lie in the image.
