@@ -86,12 +86,11 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             (
                 "ATE RMSE in metres, lower is better; the lowest value of a row is bold. `full` is the default"
                 " configuration, `realtime` is `--config realtime`, which segments every second frame, and `baseline`"
-                " is `--segmenter none`. ORB-SLAM3 (PyPI) is pyorbslam3 with a vocabulary trained on the sequences; it"
-                " gets the frames at half the rate of the recording, so that its threads keep up, and is not"
-                " deterministic. A system that skips hard frames has a lower error, so coverage is given if it is below"
-                " 100%. Parameters of v3d_torch were chosen on these sequences, those of the other systems are their"
-                " defaults. Results on the same sequences played backwards, mirrored, or with changed images, on which"
-                " no parameter was chosen, are among the [design choices](#design-choices)."
+                " is `--segmenter none`. ORB-SLAM3 (PyPI) is pyorbslam3 with a vocabulary trained on the sequences;"
+                " it is not deterministic. A system that skips hard frames has a lower error, so coverage is given if"
+                " it is below 100%. Parameters of v3d_torch were chosen on these sequences, those of the other"
+                " systems are their defaults. Results on the same sequences played backwards, mirrored, or with"
+                " changed images, on which no parameter was chosen, are among the [design choices](#design-choices)."
             ),
             accuracy_table,
             key="system",
