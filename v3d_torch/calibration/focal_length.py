@@ -23,6 +23,9 @@ followed by a more accurate one."""
 _SIGNIFICANCE = 3.0
 """Number of standard deviations by which the change of an estimate must exceed the model error."""
 
+_MAX_FOCAL_LENGTH = 8.0
+"""Longest plausible focal length, widths of the image: a field of view of 7 degrees."""
+
 _FACTORS = (0.6, 1.0, 1.7)
 """Focal lengths relative to the given ones from which the minimum is searched. In a map that was built with wrong focal
 lengths, the cost can have another minimum near these, or decrease without end towards long ones: matches that do not
@@ -56,6 +59,9 @@ def better_focal_lengths(tables: MapTables, camera: PinholeCamera, config: Confi
     if not bool(((scales[best] - step / given - 1).abs()[:2] > _MODEL_ERROR).any()):
         return None
     minima = [problem.minimise(names, given * scale) for scale in scales]
+    minima = [found for found in minima if bool((found[0][:2] <= _MAX_FOCAL_LENGTH * camera.width).all())]
+    if not minima:
+        return None
     values, at = min(minima, key=lambda found: float(problem.adjust(names, found[0], *found[1][:2]).cost))
     sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
     change = (values / given).log().abs()
