@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import torch
 from helpers.first_frames import FirstFrames
+from helpers.threads import torch_threads
 
 from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config.loading import load_config
@@ -22,24 +21,16 @@ RUNS = {
 }
 
 
-@pytest.fixture
-def one_thread_after() -> Iterator[None]:
-    """Restore one thread after the test."""
-    yield
-    torch.set_num_threads(1)
-
-
 def trajectory(sequence: RGBDSequence, overrides: tuple[str, ...], path: Path) -> bytes:
     config = load_config(None, overrides)
-    torch.set_num_threads(config.threads)
-    pipeline = Pipeline(FirstFrames(sequence, FRAMES), V3DSLAM(sequence.camera, config=config))
-    assert pipeline().failure is None
+    with torch_threads(config.threads):
+        pipeline = Pipeline(FirstFrames(sequence, FRAMES), V3DSLAM(sequence.camera, config=config))
+        assert pipeline().failure is None
     write_trajectory(path, pipeline.slam.poses.trajectory())
     return path.read_bytes()
 
 
 @pytest.mark.parametrize("name", ["demo", "walkers_desk", "crowd_rpy"])
-@pytest.mark.usefixtures("one_thread_after")
 def test_trajectory_is_identical_in_every_run(name: str, request: pytest.FixtureRequest, tmp_path: Path) -> None:
     """With the network. The camera of walkers_desk rolls, so its images are rotated by the predicted pose."""
     sequence = load_sequence(name if name == "demo" else str(request.getfixturevalue("real_sequence")(name)))

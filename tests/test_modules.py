@@ -27,6 +27,7 @@ from helpers.module_cases import (
     tensors,
     without_padding,
 )
+from helpers.threads import torch_threads
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -124,12 +125,8 @@ def test_rows_of_a_batch_are_independent(case: Case) -> None:
 def test_module_is_deterministic_for_any_number_of_threads(case: Case) -> None:
     inputs = case.inputs(6, 200, torch.float32)
     result = case.module(**inputs)
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         assert_same(case.module(**inputs), result)
-    finally:
-        torch.set_num_threads(threads)
 
 
 @each
@@ -327,25 +324,54 @@ IMPLICIT = {"EssentialRANSAC", "PnPRANSAC", "PoseRefiner", "BundleAdjuster", "Po
 """Solvers that compute Jacobians in forward mode; torch cannot nest these in its dual levels, only in `torch.func`."""
 
 
-@pytest.mark.parametrize(
-    ("title", "name"), [(title, name) for title, case in DIFFERENTIABLE.items() for name in case.differentiable]
-)
-def test_tangent_of_forward_mode_differentiation_equals_jvp(title: str, name: str) -> None:
+ARGUMENTS = [(title, name) for title, case in DIFFERENTIABLE.items() for name in case.differentiable]
+
+
+def with_direction(title: str, name: str) -> tuple[Callable[[Tensor], tuple[Tensor, ...]], Tensor, Tensor]:
+    """A function of one of its arguments, the value of the argument, and a direction in which it changes."""
     case = DIFFERENTIABLE[title]
     inputs = case.inputs(2, 12, torch.float64)
-    direction = random(*inputs[name].shape, dtype=torch.float64, seed=3) - 0.5
 
     def function(argument: Tensor) -> tuple[Tensor, ...]:
         return tensors(case.function(**inputs | {name: argument}))
 
+    return function, inputs[name], random(*inputs[name].shape, dtype=torch.float64, seed=3) - 0.5
+
+
+@pytest.mark.parametrize(("title", "name"), [each for each in ARGUMENTS if each[0] in IMPLICIT])
+def test_solvers_reject_the_dual_levels_of_torch(title: str, name: str) -> None:
+    function, argument, direction = with_direction(title, name)
+    with (
+        forward_ad.dual_level(),
+        pytest.raises(RuntimeError, match="Nested forward mode AD is not supported"),
+    ):
+        function(forward_ad.make_dual(argument, direction))
+
+
+@pytest.mark.parametrize(("title", "name"), [each for each in ARGUMENTS if each[0] in IMPLICIT])
+def test_jvp_of_solvers_is_the_adjoint_of_vjp(title: str, name: str) -> None:
+    """The test files of the solvers compare gradients, which are those of vjp, with finite differences."""
+    function, argument, direction = with_direction(title, name)
+
+    def results(argument: Tensor) -> Tensor:
+        numbers = [each.flatten() for each in function(argument) if each.is_floating_point()]
+        return torch.cat(numbers).nan_to_num()
+
+    value, tangent = torch.func.jvp(results, (argument,), (direction,))
+    cotangent = random(*value.shape, dtype=torch.float64, seed=4) - 0.5
+    (gradient,) = torch.func.vjp(results, argument)[1](cotangent)
+    assert tangent.any()
+    torch.testing.assert_close((tangent * cotangent).sum(), (direction * gradient).sum(), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize(("title", "name"), [each for each in ARGUMENTS if each[0] not in IMPLICIT])
+def test_tangent_of_forward_mode_differentiation_equals_jvp(title: str, name: str) -> None:
+    function, argument, direction = with_direction(title, name)
     with forward_ad.dual_level():
-        dual = forward_ad.make_dual(inputs[name], direction)
-        if title in IMPLICIT:
-            with pytest.raises(RuntimeError, match="Nested forward mode AD is not supported"):
-                function(dual)
-            return
-        found = [forward_ad.unpack_dual(result).tangent for result in function(dual)]
-    values, expected = torch.func.jvp(function, (inputs[name],), (direction,))
+        found = [
+            forward_ad.unpack_dual(result).tangent for result in function(forward_ad.make_dual(argument, direction))
+        ]
+    values, expected = torch.func.jvp(function, (argument,), (direction,))
     for value, one, other in zip(values, found, expected, strict=True):
         assert other[value.isfinite()].isfinite().all()
         torch.testing.assert_close(torch.zeros_like(other) if one is None else one, other, equal_nan=True)

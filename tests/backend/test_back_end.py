@@ -102,8 +102,9 @@ def test_loops_are_detected_from_the_adjusted_poses(demo: RGBDSequence, monkeypa
 
     monkeypatch.setattr(slam.loop_closer, "detect_loop", detect_loop)
     for frame, is_adjusted in ((0, False), (2, True)):
-        while len(slam.poses) <= frame:
-            slam(demo[len(slam.poses)])
+        for index in range(len(slam.poses), frame + 1):
+            slam(demo[index])
+        assert len(slam.poses) == frame + 1
         result = slam.back_end.result()
         assert result is not None and (result.adjustment is not None) is is_adjusted
         assert torch.equal(given[-1], slam.map.T_cw if result.adjustment is None else result.adjustment.T_cw)
@@ -267,9 +268,14 @@ class ImmediateExecutor:
 def test_loop_of_a_loaded_state_is_found_however_early_the_thread_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     """The database of places must be complete when the pending keyframe is submitted."""
     pipeline = make_pipeline(prefetch=False)
-    slam, frames = pipeline.slam, iter(pipeline.sequence)
-    while (expected := slam.back_end.result()) is None or expected.loop_correction is None:
-        slam(next(frames))
+    slam = pipeline.slam
+    for frame in pipeline.sequence:
+        slam(frame)
+        expected = slam.back_end.result()
+        if expected is not None and expected.loop_correction is not None:
+            break
+    else:
+        pytest.fail("no loop was found")
     state = slam.state_dict()
     monkeypatch.setattr(v3d_torch.backend.back_end, "ThreadPoolExecutor", ImmediateExecutor)
     loaded = make_pipeline(prefetch=True).slam

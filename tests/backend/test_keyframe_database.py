@@ -8,11 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import cv2
-import faiss
 import kornia_rs
 import numpy as np
 import pytest
 import torch
+from helpers.threads import faiss_threads
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
@@ -101,14 +101,12 @@ def test_empty_database_and_empty_query_give_no_keyframes() -> None:
 def test_results_do_not_depend_on_the_number_of_threads() -> None:
     place = descriptors(300, seed=0)
     results = []
-    threads = faiss.omp_get_max_threads()
     for count in (1, 4):
-        faiss.omp_set_num_threads(count)
-        database = KeyframeDatabase()
-        for k in range(20):
-            database.add(k, with_bit_errors(place, 0.01 * k, seed=k))
-        results.append(database.query(place, k=10))
-    faiss.omp_set_num_threads(threads)
+        with faiss_threads(count):
+            database = KeyframeDatabase()
+            for k in range(20):
+                database.add(k, with_bit_errors(place, 0.01 * k, seed=k))
+            results.append(database.query(place, k=10))
     assert results[0] == results[1]
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.random_numbers import RandomNumbers
+from helpers.waiting import steps_until
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase
@@ -190,7 +191,7 @@ def test_loop_correction_fuses_the_landmarks_of_both_laps(closed: Camera, drifte
 def test_loop_correction_keeps_landmark_reprojection() -> None:
     """Landmarks move with the keyframe that created them."""
     camera, room = Camera(), Room(seed=1)
-    while not any(correction is not None for correction in camera.corrections):
+    for _ in steps_until(lambda: camera.loop_closer.loop_count > 0, 2 * LAP, "a loop was closed"):
         camera.step(room, lap_pose(len(camera.true_poses)))
     table, landmarks = camera.map.observations, camera.map.landmarks
     T_cw = torch.stack([keyframe.T_cw for keyframe in camera.map.keyframes])[table["keyframe"]]
@@ -218,7 +219,7 @@ def test_convention_correction_maps_old_world_to_new_world() -> None:
     camera, room = Camera(), Room(seed=1)
     # Without loop closing, the newest keyframe keeps the pose that it had before the correction.
     twin = Camera("loop.enabled=false")
-    while not any(correction is not None for correction in camera.corrections):
+    for _ in steps_until(lambda: camera.loop_closer.loop_count > 0, 2 * LAP, "a loop was closed"):
         k = len(camera.true_poses)
         camera.step(room, lap_pose(k))
         twin.step(room, lap_pose(k))
@@ -363,7 +364,7 @@ def test_loop_joins_the_disconnected_part_of_the_map() -> None:
         camera.step(room, lap_pose(k), part=int(k > 12))
     assert camera.loop_closer.loop_count == 0
     assert any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
-    while camera.corrections[-1] is None:
+    for _ in steps_until(lambda: camera.corrections[-1] is not None, 2 * LAP, "a loop was closed"):
         camera.step(room, lap_pose(len(camera.true_poses)), part=1)
     assert not any(keyframe.is_disconnected for keyframe in camera.map.keyframes)
 
@@ -387,7 +388,7 @@ def test_loop_corrects_a_wrong_guess_without_deforming_the_map() -> None:
 def test_loop_of_a_camera_that_was_lost_twice_joins_only_the_part_at_its_end() -> None:
     """Parts 0, 1 and 2 begin at keyframes 0, 8 and 16; the second lap passes part 0, and then part 1."""
     camera, room = Camera(), Room(seed=1)
-    while camera.loop_closer.loop_count < 1:
+    for _ in steps_until(lambda: camera.loop_closer.loop_count >= 1, 2 * LAP, "loop 1 was closed"):
         k = len(camera.true_poses)
         camera.step(room, lap_pose(k), part=min(k // 8, 2), guess=WRONG_GUESS if k in (8, 16) else None)
         if k == 15:
@@ -397,7 +398,7 @@ def test_loop_of_a_camera_that_was_lost_twice_joins_only_the_part_at_its_end() -
     torch.testing.assert_close(camera.map.T_cw[8:16], guessed, rtol=0, atol=1e-9)
     errors = camera.errors()
     assert errors[8] > 0.4 and errors[:8].max() < 0.1 and errors[16:].max() < 0.1
-    while camera.loop_closer.loop_count < 2:
+    for _ in steps_until(lambda: camera.loop_closer.loop_count >= 2, 2 * LAP, "loop 2 was closed"):
         camera.step(room, lap_pose(len(camera.true_poses)))
     assert 8 <= camera.map.loops[1].i < 16
     assert not any(keyframe.is_disconnected for keyframe in camera.map.keyframes)

@@ -160,6 +160,39 @@ def test_undistort_and_no_masks(results: Path, tmp_path: Path) -> None:
     assert (mask == 255).all()  # the demo has no lens distortion
 
 
+def test_undistort_removes_the_lens_distortion_of_images_and_camera(
+    results: Path, sequence: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "walk"
+    shutil.copytree(sequence, folder)
+    text = (folder / "camera.yaml").read_text()
+    without, coefficients = "distortion: [0.0, 0.0, 0.0, 0.0, 0.0]", (0.26, -0.95, -0.005, 0.003, 1.16)
+    assert without in text
+    (folder / "camera.yaml").write_text(text.replace(without, f"distortion: {list(coefficients)}"))
+    for name, options in (("recorded", ()), ("straight", ("--undistort",))):
+        arguments = ("--format", "nerfstudio", "--out", tmp_path / name, "--every", "6", "--seq", folder, *options)
+        done = call(results, *arguments)
+        assert done.exit_code == 0, done.stderr
+    recorded, straight = (
+        json.loads((tmp_path / name / "transforms.json").read_text()) for name in ("recorded", "straight")
+    )
+    lens = ("k1", "k2", "p1", "p2", "k3")
+    assert tuple(recorded[name] for name in lens) == coefficients
+    assert [straight[name] for name in lens] == [0.0] * 5
+    assert all(straight[name] == recorded[name] for name in ("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    source = load_sequence(str(folder))
+    undistort = posed_image.Undistorter(source.camera)
+    for index, entry in zip((0, 6), straight["frames"], strict=True):
+        saved = cv2.imread(str(results / "map_masks" / f"{source[index].stamp:.6f}.png"), cv2.IMREAD_UNCHANGED)
+        image = posed_image.PosedImage(source[index], torch.eye(4, dtype=torch.float64), torch.from_numpy(saved == 0))
+        expected = undistort(image)
+        assert not torch.equal(expected.frame.image, source[index].image)
+        colour = cv2.imread(str(tmp_path / "straight" / entry["file_path"]))[..., ::-1]
+        np.testing.assert_array_equal(colour, expected.frame.image.permute(1, 2, 0))
+        mask = cv2.imread(str(tmp_path / "straight" / entry["mask_path"]), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(mask == 255, expected.static)
+
+
 def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(results, copy)

@@ -15,6 +15,7 @@ import pytest
 from helpers.commands import assert_error_line, command, invoke
 from helpers.demo_frames import copy_frames
 from helpers.forked_command import start_forked
+from helpers.waiting import wait_until
 from helpers.walker_folder import write_walker
 from helpers.walls import Slide
 from typer.testing import Result
@@ -118,9 +119,12 @@ def test_camera_is_tracked_again_within_a_second_after_the_process_was_stopped_f
     options = ["--seq", folder, "--segmenter", "none", "--realtime", "--save-masks", "--out", out]
     process = start_forked(*options, cwd=tmp_path)
     assert process.pid is not None
-    while len(masks := sorted((out / "masks").glob("*.png"))) < 3:
-        assert process.is_alive()
-        time.sleep(0.05)
+    folder_of_masks = out / "masks"
+    wait_until(
+        lambda: len(list(folder_of_masks.glob("*.png"))) >= 3 or not process.is_alive(), 300, "three masks were written"
+    )
+    masks = sorted(folder_of_masks.glob("*.png"))
+    assert process.is_alive()
     os.kill(process.pid, signal.SIGSTOP)
     time.sleep(1)
     os.kill(process.pid, signal.SIGCONT)

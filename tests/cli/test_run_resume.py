@@ -15,7 +15,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from helpers.bag_messages import read_with_mcap
 from helpers.commands import assert_error_line, invoke
 from helpers.corpus import base
@@ -619,4 +618,3 @@ def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
         f"{tmp_path}: the run of a live stream (realsense:) cannot be resumed; its results so far are in",
         " in trajectory.txt\n",
     )
-    torch.set_num_threads(1)

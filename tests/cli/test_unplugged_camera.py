@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from helpers.simulated_realsense import SimulatedDevice
+from helpers.waiting import wait_until
 from typer.testing import CliRunner, Result
 
 from v3d_torch.cli.commands import app
@@ -38,11 +39,12 @@ def call_until_unplugged(monkeypatch: pytest.MonkeyPatch, count_frames: Callable
         return device
 
     def unplug_and_interrupt() -> None:
-        while count_frames() < 4:
-            time.sleep(0.02)
-        device.unplugged.set()
-        waiting.wait()
-        os.kill(os.getpid(), signal.SIGINT)
+        try:
+            wait_until(lambda: count_frames() >= 4, PATIENCE, "four frames were processed")
+            device.unplugged.set()
+            assert waiting.wait(PATIENCE), "the command does not wait for the camera"
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
         if not ended.wait(PATIENCE):
             os.kill(os.getpid(), signal.SIGINT)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import runpy
 import sys
-import time
 from array import array
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -18,6 +17,7 @@ import torch
 from helpers.bag_messages import matrix_of
 from helpers.bags import MessageFactory
 from helpers.fake_ros import FakeROS, Pair
+from helpers.waiting import wait_until
 from helpers.wall_run import CAMERA, FRAMES, STEP, WALL, Wall
 from rosbags.typesys import Stores, get_typestore
 
@@ -41,8 +41,7 @@ def images(node: Any) -> Iterator[Pair]:
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(time_of_image, 10**9)
             object.__setattr__(message, "data", array("B", message.data.tobytes()))
         yield colour, depth
-        while len(node.slam.poses) <= index:
-            time.sleep(0.001)
+        wait_until(lambda: len(node.slam.poses) > index, 60, f"image {index} was tracked")  # noqa: B023 - called here
 
 
 def make_ros(images: Callable[[Any], Iterator[Pair]]) -> FakeROS:

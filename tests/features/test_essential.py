@@ -117,7 +117,7 @@ def test_gradients_equal_finite_differences(monkeypatch: pytest.MonkeyPatch) -> 
     assert check_gradients(matrix, inputs["uv_a"], inputs["uv_b"], inputs["K"], weights)
 
 
-def test_matrix_of_a_camera_that_only_turns_is_finite() -> None:
+def test_matrix_of_a_camera_that_only_turns_is_one_that_explains_the_pairs() -> None:
     """Any translation explains the pairs, so that five of them do not determine a matrix."""
     T_ba = known_motion()
     T_ba[:3, 3] = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.threads import torch_threads
 
 from v3d_torch.geometry.long_products import sum_products
 
@@ -15,8 +16,5 @@ def test_product_equals_the_matrix_product_and_does_not_depend_on_threads(batch:
     a, b = (torch.rand(*batch, rows, width, dtype=torch.float64, generator=generator) for width in (8, 3))
     product = sum_products(a, b)
     torch.testing.assert_close(product, a.mT @ b, rtol=1e-12, atol=0)
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         assert torch.equal(sum_products(a, b), product)
-    finally:
-        torch.set_num_threads(1)

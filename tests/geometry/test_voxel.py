@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from helpers.threads import torch_threads
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -160,14 +161,10 @@ def test_memory_does_not_grow_with_the_bounding_box() -> None:
 
 def test_module_is_deterministic_for_any_number_of_threads() -> None:
     points, valid = random_clouds(2, 40_000, dtype=torch.float32)
-    threads = torch.get_num_threads()
     results = []
-    try:
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
+    for number in (1, 2, 3):
+        with torch_threads(number):
             results.append(VoxelPool(0.05)(points, valid))
-    finally:
-        torch.set_num_threads(threads)
     assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(*results, strict=True))
 
 

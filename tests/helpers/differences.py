@@ -17,6 +17,7 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.rolling_shutter import Readout
+from v3d_torch.runtime.stage_timer import StageTime
 
 TIMED_STAGES = (
     *("segmentation", "depth", "features", "odometry", "free_space", "clouds", "objects", "tracking", "mapping"),
@@ -43,7 +44,8 @@ def differences(a: Any, b: Any, path: str, compared: dict[int, Any]) -> Iterator
     elif isinstance(a, Config):  # differ in prefetching
         pass
     elif isinstance(a, Tensor):
-        if a.dtype != b.dtype or a.shape != b.shape or not torch.equal(a.nan_to_num(), b.nan_to_num()):
+        same_type = a.dtype == b.dtype and a.shape == b.shape
+        if not same_type or not torch.equal(a.isnan(), b.isnan()) or not torch.equal(a.nan_to_num(), b.nan_to_num()):
             yield path
     elif isinstance(a, np.ndarray):
         if not np.array_equal(a, b):
@@ -55,7 +57,8 @@ def differences(a: Any, b: Any, path: str, compared: dict[int, Any]) -> Iterator
             yield path
         else:
             for (name, x), y in zip(pairs, others, strict=True):
-                if name not in ("read", "seconds", *TIMED_STAGES):
+                is_time = isinstance(x, (float, StageTime)) and name in TIMED_STAGES
+                if not is_time and name not in ("read", "seconds"):
                     yield from differences(x, y, f"{path}.{name}", compared)
     elif isinstance(a, faiss.IndexBinaryHash):
         if a.ntotal != b.ntotal:

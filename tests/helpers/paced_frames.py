@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator
 
+from helpers.waiting import wait_until
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
@@ -15,5 +15,4 @@ def paced(frames: Iterable[RGBDFrame], slam: V3DSLAM) -> Iterator[RGBDFrame]:
     for frame in frames:
         yield frame
         newest = max(newest, frame.stamp)
-        while slam.poses.stamp < newest:
-            time.sleep(0.001)
+        wait_until(lambda: slam.poses.stamp >= newest, 120, f"the frame at {newest} s was tracked")  # noqa: B023

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import io
-import os
 import tarfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.folders import names_in
 
@@ -81,7 +81,7 @@ def test_total_size_is_limited(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.999])
 def test_truncated_archive_is_an_input_error(tmp_path: Path, keep: float) -> None:
-    archive = write_archive(tmp_path / "a.tgz", file_member("seq/a", os.urandom(50_000)))
+    archive = write_archive(tmp_path / "a.tgz", file_member("seq/a", np.random.default_rng(0).bytes(50_000)))
     archive.write_bytes(archive.read_bytes()[: int(keep * archive.stat().st_size)])
     with pytest.raises(InputError, match="not a complete tar archive"):
         extract_tar(archive, tmp_path / "out")
@@ -94,7 +94,7 @@ def test_changed_byte_is_an_input_error(tmp_path: Path, kind: str, position: flo
     """Also behind the last member, which `tarfile` does not read."""
     path = tmp_path / "a.tgz"
     with tarfile.open(path, f"w:{kind}") as tar:
-        info, content = file_member("seq/a", os.urandom(20_000))
+        info, content = file_member("seq/a", np.random.default_rng(0).bytes(20_000))
         info.size = len(content)
         tar.addfile(info, io.BytesIO(content))
     content = bytearray(path.read_bytes())

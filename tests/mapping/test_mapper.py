@@ -6,6 +6,7 @@ import copy
 
 import torch
 from helpers.sparse_maps import CAMERA, EYE, features
+from helpers.waiting import steps_until
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.mapping.covisibility import covisibility_edges
@@ -109,13 +110,13 @@ def test_lost_camera_starts_a_disconnected_part_of_the_map_after_the_delay() -> 
 def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:
     feed = FrameFeeder(restart_after=0.5, max_keyframe_interval=5)
     assert feed(0, LOST)
-    while len(feed.mapper.map.keyframes) < 2:
+    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 2, 100, "there are 2 keyframes"):
         feed(0, LOST)
-    while len(feed.mapper.map.keyframes) < 3:
+    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 3, 100, "there are 3 keyframes"):
         feed(300)
-    while len(feed.mapper.map.keyframes) < 4:
+    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 4, 100, "there are 4 keyframes"):
         feed(0, LOST)
-    while len(feed.mapper.map.keyframes) < 5:
+    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 5, 100, "there are 5 keyframes"):
         feed(300)
     assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 1, 1, 2, 2]
     assert covisibility_edges(feed.mapper.map, 1000).tolist() == [[1, 2], [3, 4]]
@@ -124,10 +125,10 @@ def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:
 def test_part_that_a_lost_camera_starts_after_parts_were_joined_has_an_unused_id() -> None:
     feed = FrameFeeder(restart_after=0.5)
     assert feed(0, LOST)
-    while len(feed.mapper.map.keyframes) < 3:
+    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 3, 100, "there are 3 keyframes"):
         feed(0, LOST)
     feed.mapper.map.join_parts(0, 1)
-    while len(feed.mapper.map.keyframes) < 4:
+    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 4, 100, "there are 4 keyframes"):
         feed(0, LOST)
     assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 0, 2, 3]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.threads import torch_threads
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
@@ -172,14 +173,10 @@ def test_distance_is_repeatable_and_independent_of_point_order() -> None:
 
 def test_number_of_threads_does_not_change_the_distance() -> None:
     p, q = random_pair(3, 4000, 3000)
-    threads = torch.get_num_threads()
     distances = []
-    try:
-        for number in (1, 2, 3):
-            torch.set_num_threads(number)
+    for number in (1, 2, 3):
+        with torch_threads(number):
             distances.append(chamfer_distance(p, q))
-    finally:
-        torch.set_num_threads(threads)
     assert torch.equal(distances[0], distances[1]) and torch.equal(distances[0], distances[2])
 
 

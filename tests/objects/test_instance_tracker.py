@@ -337,9 +337,7 @@ def test_missed_object_is_predicted_with_its_mask_and_then_removed(rate: float) 
     frames = int(0.8 * rate)
     for frame in range(frames):
         track_boards(Board(-0.5 + step * frame, 2.0), Board(-1.4, 3.0, label=CHAIR))
-    gap = 0
-    while True:
-        gap += 1
+    for gap in range(1, 2 * frames):
         hidden = Board(-0.5 + step * (frames + gap - 1), 2.0, detected=False)
         tracks = track_boards(hidden, Board(-1.4, 3.0, label=CHAIR))
         missed = [track for track in tracks if track.missed]
@@ -351,6 +349,8 @@ def test_missed_object_is_predicted_with_its_mask_and_then_removed(rate: float) 
         assert float((predicted & truth).sum()) / float(truth.sum()) > 0.9
         assert float((predicted & ~truth).sum()) / float(truth.sum()) < 0.3
         assert float((mask_centre(predicted) - mask_centre(truth)).abs().max()) < 2.0
+    else:
+        pytest.fail("the object was not removed")
     # Predicted for half a second, with one frame of rounding, then removed.
     assert gap - 1 in (int(0.5 * rate), int(0.5 * rate - 1e-9))
     assert [track.id for track in tracks] == [2]

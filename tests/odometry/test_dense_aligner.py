@@ -26,6 +26,7 @@ from helpers.rendered_planes import (
     uniform,
     vertical_stripes,
 )
+from helpers.threads import torch_threads
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
@@ -113,11 +114,8 @@ def test_alignment_is_deterministic_for_any_number_of_threads() -> None:
         return aligner.align_views(aligner.view(*a, ALL_PIXELS), aligner.view(*b, ALL_PIXELS), MOTION)
 
     first, second = run(), run()
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         third = run()
-    finally:
-        torch.set_num_threads(1)
     for other in (second, third):
         assert first is not None and other is not None
         assert torch.equal(first.T_ba, other.T_ba)

@@ -50,6 +50,29 @@ def test_motion_is_deterministic() -> None:
     assert torch.equal(first.T_ba, second.T_ba)
 
 
+def test_number_of_matched_features_is_limited_with_an_initial_guess() -> None:
+    """The selected features are in different cells; without a guess all features are matched."""
+    a, b, T_ba = two_views()
+    config = Config().odometry.model_copy(update={"max_features": 50})
+    estimate = MotionEstimator(config, Config().features, CAMERA, seed=0)
+    limited, unlimited = estimate(a, b, initial_guess=T_ba), estimate(a, b)
+    assert limited is not None and unlimited is not None
+    assert len(limited.matches) == len(limited.pairs) == 50 and len(unlimited.matches) == 400
+    cells = a.pixel[limited.matches[:, 0]] // Config().features.cell
+    assert len(cells.unique(dim=0)) == 50
+    assert torch.allclose(limited.T_ba, T_ba, atol=1e-6)
+
+
+def test_features_without_depth_do_not_count_among_the_matched_ones() -> None:
+    a, b, T_ba = two_views()
+    depth = torch.where(torch.arange(400) % 4 == 0, a.depth, 0.0)
+    config = Config().odometry.model_copy(update={"max_features": 50})
+    estimate = MotionEstimator(config, Config().features, CAMERA, seed=0)
+    motion = estimate(Features(a.uv, a.pixel, depth, a.octave, a.descriptors), b, initial_guess=T_ba)
+    assert motion is not None and len(motion.matches) == 50
+    assert (motion.matches[:, 0] % 4 == 0).all()
+
+
 def test_speed_is_bounded_also_between_frames_that_were_received_at_once() -> None:
     xi = torch.tensor([0.03, 0, 0, 0, 0.02, 0], dtype=torch.float64)
     motion = RelativeMotion(se3_exp(xi), torch.zeros(0, 2, dtype=torch.int64))

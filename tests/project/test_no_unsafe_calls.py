@@ -57,15 +57,33 @@ def test_code_contains_no_other_address() -> None:
     """The only address without https is that of the viewer, on the same machine."""
     hosts = set()
     for name, source in sources():
-        nodes = list(ast.walk(ast.parse(source)))
-        docstrings = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}  # also those of attributes
-        for node in nodes:
-            if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
-                for address in re.findall(r"\b[\w+]+://[^\s\"'<>]+", node.value):
-                    hosts.add((urlsplit(address).scheme, urlsplit(address).hostname, name))
-    assert {(scheme, host) for scheme, host, _ in hosts} - {("https", host) for host in HOSTS} <= {
-        ("rerun+http", "127.0.0.1")
+        for text in strings(source):
+            for address in re.findall(r"\b[\w+]+://[^\s\"'<>]+", text):
+                hosts.add((urlsplit(address).scheme, urlsplit(address).hostname, name))
+    assert {(scheme, host) for scheme, host, _ in hosts} == {
+        *(("https", host) for host in HOSTS),
+        ("rerun+http", "127.0.0.1"),
     }, hosts
+
+
+def strings(source: str) -> Iterator[str]:
+    """Return all strings of a source but its docstrings, which are statements of their own."""
+    tree = ast.parse(source)
+    docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            yield node.value
+
+
+def test_addresses_in_messages_are_found_and_those_in_docstrings_are_not() -> None:
+    source = '''
+"""A module, see https://a.org"""
+A = 1
+"""An attribute, see https://b.org"""
+raise ValueError(f"{A}: is too large; see https://c.org for the limits")
+'''
+    found = [address for text in strings(source) for address in re.findall(r"https://[^ ]+", text)]
+    assert found == ["https://c.org"]
 
 
 @pytest.mark.parametrize(
@@ -75,10 +93,12 @@ def test_sequence_names_cannot_change_the_download_host(name: str) -> None:
     assert canonical_name(name) is None
 
 
-@pytest.mark.parametrize("name", ["fr3/w/xyz", "fr1/desk", "rgbd_dataset_freiburg2_xyz", "fr3_sitting_rpy"])
-def test_sequences_are_downloaded_from_the_host_of_the_data_set(name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["fr3/w/xyz", " FR3\\W\\XYZ/", "../../fr1/desk", "walking_rpy", "tum.freiburg3-office-val"]
+)
+def test_other_spellings_of_sequence_names_have_the_same_download_host(name: str) -> None:
     full = canonical_name(name)
-    assert full is not None and urlsplit(download_url(full)).netloc == "cvg.cit.tum.de"
+    assert full in SEQUENCES and urlsplit(download_url(full)).netloc == "cvg.cit.tum.de"
 
 
 def test_security_rules_are_enabled_with_known_exceptions() -> None:
@@ -109,27 +129,55 @@ def test_yaml_loader_is_safe() -> None:
 
 
 def test_pickles_are_only_loaded_with_weights_only() -> None:
-    calls = [
-        (name, ast.unparse(node))
-        for name, source in sources()
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.Call)
-        and re.fullmatch(r"(pickle|torch|np|numpy|joblib)\.loads?", ast.unparse(node.func))
-    ]
+    calls = [(name, call) for name, source in sources() for call in pickle_loads(source)]
     assert sorted(name for name, _ in calls) == ["io/state_file.py", "segmentation/pt_weights.py"]
     assert all("weights_only=True" in call for _, call in calls)
 
 
-def test_functions_that_unpickle_are_not_imported_under_other_names() -> None:
-    for name, source in sources():
-        for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.ImportFrom) and node.module in ("torch", "numpy", "joblib", "pickle"):
-                assert not {each.name for each in node.names} & {"load", "loads", "Unpickler"}, name
-            if isinstance(node, ast.Import):
-                renamed = {each.name: each.asname for each in node.names if each.asname}
-                assert renamed.get("numpy", "np") == "np" and not {"torch", "joblib", "pickle"} & renamed.keys(), name
-            if isinstance(node, ast.keyword) and node.arg == "allow_pickle":
-                assert ast.unparse(node.value) == "False", name
+PICKLE_LOADER = re.compile(
+    r"(_?pickle|dill|cloudpickle|joblib|marshal|shelve|torch|numpy)\.(\w+\.)*(loads?|Unpickler|open)"
+    r"|pandas\.(\w+\.)*read_pickle"
+)
+"""Full names of functions that can load pickles."""
+
+
+def pickle_loads(source: str) -> list[str]:
+    """Return the calls of a source that can load pickles, under any name that it imports."""
+    tree = ast.parse(source)
+    modules = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            modules |= {each.asname: each.name for each in node.names if each.asname}
+        elif isinstance(node, ast.ImportFrom):
+            modules |= {each.asname or each.name: f"{node.module}.{each.name}" for each in node.names}
+    calls = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            first, *others = ast.unparse(node.func).split(".")
+            name = ".".join([modules.get(first, first), *others])
+            allowed = [each.value for each in node.keywords if each.arg == "allow_pickle"]
+            if PICKLE_LOADER.fullmatch(name) or any(ast.unparse(each) != "False" for each in allowed):
+                calls.append(ast.unparse(node))
+    return calls
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("import pickle\npickle.loads(b'')", 1),
+        ("import pickle as p\np.Unpickler(file).load()", 1),
+        ("from torch import load\nload(path)", 1),
+        ("from torch import load as read\nread(path)", 1),
+        ("from torch import jit\njit.load(path)", 1),
+        ("import numpy as other\nother.load(path, allow_pickle=True)", 1),
+        ("from somewhere import read\nread(path, allow_pickle=flag)", 1),
+        ("from somewhere import read\nread(path, allow_pickle=False)", 0),
+        ("import json\njson.loads('')", 0),
+        ("import onnx\nonnx.load(path)", 0),
+    ],
+)
+def test_loaders_of_pickles_are_found_under_any_name(source: str, count: int) -> None:
+    assert len(pickle_loads(source)) == count
 
 
 # --- licences

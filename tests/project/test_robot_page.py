@@ -7,13 +7,13 @@ import os
 import re
 import signal
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 from helpers.simulated_realsense import SimulatedDevice
+from helpers.waiting import wait_until
 from typer.testing import CliRunner
 
 import v3d_torch as v3d
@@ -64,9 +64,10 @@ def interrupt_when(condition: Callable[[], bool]) -> None:
     """Press Ctrl-C in this process as soon as a condition holds."""
 
     def wait() -> None:
-        while not condition():
-            time.sleep(0.02)
-        os.kill(os.getpid(), signal.SIGINT)
+        try:
+            wait_until(condition, 120, "the command has processed some frames")
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=wait, daemon=True).start()
 

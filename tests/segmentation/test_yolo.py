@@ -12,6 +12,7 @@ import pytest
 import torch
 from helpers.default_dtype import default_dtype
 from helpers.photographs import photograph
+from helpers.threads import torch_threads
 from onnx import TensorProto, helper
 from PIL import Image, ImageDraw
 
@@ -96,11 +97,8 @@ def test_results_do_not_depend_on_the_number_of_threads() -> None:
     image = photograph("coffee")
     one, two = (YOLOSegmenter(SegmentationConfig(**(SMALL | {"threads": threads}))) for threads in (1, 2))
     first, again = one.segment(image), one.segment(image)
-    try:
-        torch.set_num_threads(2)
+    with torch_threads(2):
         other = two.segment(image)
-    finally:
-        torch.set_num_threads(1)
     for name in ("masks", "labels", "scores", "boxes"):
         assert torch.equal(getattr(first, name), getattr(again, name))
         assert torch.equal(getattr(first, name), getattr(other, name))

@@ -71,8 +71,12 @@ def test_noise_of_poses_at_the_rate_of_a_camera_is_not_measured() -> None:
     assert not consistency.groundtruth_noise(Trajectory(stamps, poses)).any()
 
 
-def test_covariance_on_recorded_images_is_consistent(real_sequence: Callable[[str], Path]) -> None:
-    """A second and a half of a rotating camera, with true masks: neither position nor rotation are overconfident."""
+def test_covariance_on_recorded_images_is_not_overconfident(real_sequence: Callable[[str], Path]) -> None:
+    """A second and a half of a rotating camera, with true masks, for position and rotation.
+
+    The mean NEES is below the upper bound of consistent poses. It has a rough lower bound only, because the calibration
+    of the ground truth fits 13 numbers to the errors of this short part.
+    """
     folder = real_sequence("crowd_rpy")
     sequence = load_sequence(str(folder))
     assert sequence.groundtruth is not None
@@ -88,5 +92,6 @@ def test_covariance_on_recorded_images_is_consistent(real_sequence: Callable[[st
     )
     for dimensions in (slice(0, 3), slice(3, 6)):
         nees = errors.nees(dimensions)
-        assert 0.2 < float(nees.mean()) < 6
+        _, high = consistency.mean_bounds(2 * nees)  # bounds of six dimensions
+        assert 1.0 < float(nees.mean()) < high / 2
         assert float((nees < chi2.ppf(0.95, 3)).double().mean()) > 0.8

@@ -10,6 +10,7 @@ import pytest
 import torch
 from helpers.demo_frames import copy_frames
 from helpers.demo_views import world_points
+from helpers.threads import torch_threads
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.config import Config
@@ -36,13 +37,9 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_bytes_are_independent_of_threads_and_selected_frames(sequence: Path, tmp_path: Path) -> None:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
+    with torch_threads(2):
         write_sequence(tmp_path, range(40, 41))
         assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(threads)
     first, second = read_files(sequence), read_files(tmp_path)
     image_names = [name for name in second if name.endswith((".png", ".jpg"))]
     assert len(image_names) == 4

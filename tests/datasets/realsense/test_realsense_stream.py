@@ -32,6 +32,7 @@ from helpers.simulated_realsense import (
     rs,
 )
 from helpers.tiny_images import CAMERA_YAML, as_rgb, colour_of
+from helpers.waiting import wait_until
 from typer.testing import CliRunner
 
 from v3d_torch.cli import record, run
@@ -339,9 +340,11 @@ def test_record_command_saves_frames_until_ctrl_c(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(OPEN_LIVE_DEVICE, lambda *request: (requests.append(request), camera)[1])
 
     def interrupt() -> None:
-        while len(list((tmp_path / "out" / "depth").glob("[0-9]*"))) < 4:
-            time.sleep(0.02)
-        os.kill(os.getpid(), signal.SIGINT)
+        depth = tmp_path / "out" / "depth"
+        try:
+            wait_until(lambda: len(list(depth.glob("[0-9]*"))) >= 4, 60, "four frames were recorded")
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
     done = CliRunner().invoke(record.app, ["--out", str(tmp_path / "out"), "--fps", "15"])
@@ -364,9 +367,11 @@ def test_run_command_on_a_live_camera_ends_with_ctrl_c_and_results(
     out = tmp_path / "out"
 
     def interrupt() -> None:
-        while not (out / "run.log").exists() or (out / "run.log").read_text().count("frame") < 4:
-            time.sleep(0.02)
-        os.kill(os.getpid(), signal.SIGINT)
+        log = out / "run.log"
+        try:
+            wait_until(lambda: log.exists() and log.read_text().count("frame") >= 4, 60, "four frames were processed")
+        finally:
+            os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
     arguments = ["--seq", "realsense:", "--segmenter", "none", "--out", str(out), "--set", "threads=1"]
@@ -389,8 +394,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("realsense") / "take.db3"
     camera = SimulatedDevice(record_to=path)
     camera.start()
-    while camera.sent_count < 15:
-        time.sleep(0.05)
+    wait_until(lambda: camera.sent_count >= 15, 60, "fifteen frames were sent")
     camera.stop()
     return path
 
