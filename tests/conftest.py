@@ -19,6 +19,7 @@ from v3d_torch.io.paths import cache_dir
 
 if TYPE_CHECKING:
     from v3d_torch.datasets import RGBDSequence
+    from v3d_torch.datasets.demo.renderer import Renderer
     from v3d_torch.datasets.demo.scene import Scene
 
 # Threads that wait for each other would keep cores busy that other workers of the tests need. Read by torch's OpenMP.
@@ -87,11 +88,15 @@ collect_ignore = ["test_corpus.py"] if os.name == "nt" else []
 
 
 @pytest.fixture(autouse=True)
-def seed() -> None:
-    """Seed torch's global generator, so that its numbers do not depend on the tests that ran before."""
+def _same_start() -> None:
+    """Give each test the same random numbers and one thread, so that a failure can be repeated, alone and in any order.
+
+    Commands that other tests called in this process have set the number of threads.
+    """
     import torch
 
     torch.manual_seed(0)
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")
@@ -119,6 +124,16 @@ def walking_scene() -> Scene:
     from v3d_torch.datasets.demo.sequence import SEED
 
     return build_walking_scene(SEED)
+
+
+@pytest.fixture(scope="module")
+def renderer(walking_scene: Scene) -> Renderer:
+    """Renderer of small images of this scene."""
+    from helpers.demo_views import SMALL
+
+    from v3d_torch.datasets.demo.renderer import Renderer
+
+    return Renderer(walking_scene, SMALL)
 
 
 def _draw_no_run(patch: pytest.MonkeyPatch) -> None:

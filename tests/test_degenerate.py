@@ -14,6 +14,7 @@ import pytest
 import sklearn.cluster
 import torch
 from helpers import rooms
+from helpers.sparse_maps import uniform
 from torch import Tensor
 
 from v3d_torch.backend.pose_graph import optimise_pose_graph
@@ -45,13 +46,9 @@ TURN = torch.tensor([0.0, 0.0, 0.0, 0.03, -0.05, 0.02], dtype=torch.float64)
 STEP = torch.tensor([0.04, -0.02, 0.03, 0.0, 0.0, 0.0], dtype=torch.float64)
 
 
-def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
 def points(shape: str, count: int = 200) -> Tensor:
     """Points in front of the camera on a lattice of 2**-10 m, whose differences are exact at the offset, too."""
-    box = torch.stack([2 * random(count, seed=1) - 1, 1.5 * random(count, seed=2) - 0.75, 2 + random(count, seed=3)])
+    box = torch.stack([2 * uniform(count, seed=1) - 1, 1.5 * uniform(count, seed=2) - 0.75, 2 + uniform(count, seed=3)])
     x, y, z = box
     cloud = {
         "plane": torch.stack([x, y, torch.full_like(z, 2.5)], dim=1),
@@ -144,7 +141,7 @@ def test_votes_between_centroids_that_coincide(temperature: float | None) -> Non
 
 def test_votes_a_kilometre_away_are_the_same() -> None:
     previous = points("room", 30)
-    current = previous + 0.1 * (random(30, 3, seed=4) - 0.5)
+    current = previous + 0.1 * (uniform(30, 3, seed=4) - 0.5)
     near = hough_vote(previous, current, all_valid(current), 0.05, 3)
     far = hough_vote(previous + KILOMETRE, current + KILOMETRE, all_valid(current), 0.05, 3)
     assert 0 < near.dynamic.sum() < 30
@@ -248,9 +245,9 @@ def test_bundle_adjustment_of_degenerate_maps(shape: str, offset: float, cameras
     T_cw = se3_exp(torch.arange(4, dtype=torch.float64)[:, None] * pace)
     T_cw[:, :3, 3] -= T_cw[:, :3, :3] @ (offset * KILOMETRE)
     fixed = torch.tensor([True, False, False, False])
-    wrong = 0.005 * (random(4, 6, seed=5) - 0.5) * ~fixed[:, None]
+    wrong = 0.005 * (uniform(4, 6, seed=5) - 0.5) * ~fixed[:, None]
     observations = observe_all(cloud, T_cw)
-    start = cloud + 0.01 * (random(len(cloud), 3, seed=6) - 0.5)
+    start = cloud + 0.01 * (uniform(len(cloud), 3, seed=6) - 0.5)
     found = bundle_adjust(se3_exp(wrong) @ T_cw, start, **observations, fixed=fixed, iterations=30)
     assert found.T_cw.dtype == found.points.dtype == torch.float64
     assert found.T_cw.isfinite().all() and found.points.isfinite().all()
@@ -275,7 +272,7 @@ def test_pose_graph_of_degenerate_trajectories(walk: str, offset: float) -> None
     true = torch.stack(T_wc)
     edges = torch.tensor([(k, k + 1) for k in range(9)] * 2 + [(0, 9), (9, 0)])
     T_ij = invert(true[edges[:, 0]]) @ true[edges[:, 1]]
-    wrong = 0.02 * (random(10, 6, seed=7) - 0.5)
+    wrong = 0.02 * (uniform(10, 6, seed=7) - 0.5)
     wrong[0] = 0
     found = optimise_pose_graph(true @ se3_exp(wrong), edges, T_ij)
     assert found.T_wc.dtype == torch.float64 and found.T_wc.isfinite().all()
@@ -285,7 +282,7 @@ def test_pose_graph_of_degenerate_trajectories(walk: str, offset: float) -> None
 
 
 def test_pose_graph_without_edges_or_free_poses_is_unchanged() -> None:
-    T_wc = se3_exp(random(3, 6))
+    T_wc = se3_exp(uniform(3, 6, seed=0))
     nothing = torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, 4, 4, dtype=torch.float64)
     torch.testing.assert_close(optimise_pose_graph(T_wc, *nothing).T_wc, T_wc, atol=1e-12, rtol=0)
     edge = torch.tensor([[0, 1]]), torch.eye(4, dtype=torch.float64)[None]
@@ -296,7 +293,7 @@ def test_pose_graph_without_edges_or_free_poses_is_unchanged() -> None:
 @pytest.mark.parametrize("size", [(1, 1), (1, 20), (20, 1), (2, 2)])
 @pytest.mark.parametrize("z", [0.0, 2.0, 1000.0])
 def test_normals_of_images_without_interior_pixels_are_zero(size: tuple[int, int], z: float) -> None:
-    image = torch.cat([random(1, *size, 2), torch.full((1, *size, 1), z, dtype=torch.float64)], dim=-1)
+    image = torch.cat([uniform(1, *size, 2, seed=0), torch.full((1, *size, 1), z, dtype=torch.float64)], dim=-1)
     assert not surface_normals(image).any()
 
 

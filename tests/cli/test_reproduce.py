@@ -6,10 +6,8 @@ import csv
 import json
 import shutil
 import tarfile
-import threading
 from collections.abc import Generator, Iterator, Sequence
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -17,6 +15,7 @@ from typing import Any
 import pandas as pd
 import pytest
 from helpers.commands import assert_error_line, invoke
+from helpers.http_server import QuietHandler, running_server
 
 from v3d_torch.batch import reproduction
 from v3d_torch.batch.executor import JobFinished
@@ -32,11 +31,6 @@ from v3d_torch.runs.result_folder import lock_results
 SHORT = [short_name(name) for name in PAPER_SEQUENCES]
 SERVED = [name for name in PAPER_SEQUENCES if name.endswith(("walking_xyz", "sitting_rpy"))]
 """Sequences on the server."""
-
-
-class Handler(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
 
 
 call = partial(invoke, app, V3D_DATA="", NO_COLOR="1")
@@ -89,15 +83,9 @@ def archives(moment: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def server(archives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("no_proxy", "*")
     monkeypatch.setenv("V3D_CACHE", str(tmp_path / "cache"))
-    httpd = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(archives)))
-    thread = threading.Thread(target=httpd.serve_forever, kwargs={"poll_interval": 0.02})
-    thread.start()
-    address = f"http://127.0.0.1:{httpd.server_address[1]}"
-    monkeypatch.setattr(locate, "download_url", lambda name: f"{address}/{name}.tgz")
-    yield address
-    httpd.shutdown()
-    httpd.server_close()
-    thread.join()
+    with running_server(partial(QuietHandler, directory=str(archives))) as address:
+        monkeypatch.setattr(locate, "download_url", lambda name: f"{address}/{name}.tgz")
+        yield address
 
 
 @pytest.fixture

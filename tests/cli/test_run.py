@@ -247,15 +247,20 @@ def test_command_line_overrides_the_configuration_file(moment: Path, tmp_path: P
         assert line in written
 
 
+def in_millimetres(sequence: Path, folder: Path) -> Path:
+    """Copy a sequence with depth in millimetres, which its values tell, and without a depth scale; return the copy."""
+    shutil.copytree(sequence, folder)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5)
+    lines = (folder / "camera.yaml").read_text().splitlines(keepends=True)
+    (folder / "camera.yaml").write_text("".join(line for line in lines if not line.startswith("depth_scale")))
+    return folder
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
 @pytest.mark.usefixtures("undrawn")
 def test_estimated_depth_scale_is_recorded_and_shown_once_also_by_a_resumed_run(moment: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "seq"
-    shutil.copytree(moment, folder)
-    lines = (folder / "camera.yaml").read_text().splitlines(keepends=True)
-    (folder / "camera.yaml").write_text("".join(line for line in lines if not line.startswith("depth_scale")))
-    for path in (folder / "depth").iterdir():  # in millimetres, which the values tell
-        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5)
+    folder = in_millimetres(moment, tmp_path / "seq")
     arguments = ("--seq", folder, "--segmenter", "none", "--serial", "--out", tmp_path / "out")
     with at_frame(1, lambda: os.kill(os.getpid(), signal.SIGINT)):
         interrupted = call_here(*arguments, cwd=tmp_path)
@@ -524,12 +529,7 @@ def test_demo_moving_people_are_not_in_the_map(demo: tuple[Path, str]) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_estimated_depth_scale_is_reported_on_the_console_and_in_the_log(moment: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "millimetres"
-    shutil.copytree(moment, folder)
-    for path in (folder / "depth").iterdir():
-        cv2.imwrite(str(path), (cv2.imread(str(path), cv2.IMREAD_UNCHANGED) // 5).astype(np.uint16))
-    lines = (folder / "camera.yaml").read_text().splitlines()
-    (folder / "camera.yaml").write_text("\n".join(line for line in lines if not line.startswith("depth_scale")))
+    folder = in_millimetres(moment, tmp_path / "millimetres")
     done = call_here("--seq", folder, "--out", "out", "--segmenter", "none", cwd=tmp_path)
     assert (done.exit_code, done.stderr) == (0, "")
     note = re.search(

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from itertools import islice
 
 import pytest
-from helpers.wall_run import CAMERA, FRAMES, Wall
+from helpers.wall_run import CAMERA, FRAMES, StoredWall
 
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.datasets.realtime_playback import RealtimePlayback, stored_source
@@ -25,13 +25,6 @@ class SimulatedClock:
 
     def sleep(self, seconds: float) -> None:
         self.time += max(seconds, 0.0)
-
-
-class StoredWall(Wall):
-    """Wall that can be iterated."""
-
-    def __iter__(self):  # type: ignore[no-untyped-def]
-        return (self[index] for index in range(FRAMES))
 
 
 def test_frames_come_when_they_are_due() -> None:

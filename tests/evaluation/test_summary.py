@@ -245,7 +245,7 @@ def test_name_in_tables_is_one_line_without_control_characters() -> None:
     assert label_sequence("a\nb\x1b[31m", "part: 3 of 9 frames") == "a\\nb\\x1b[31m (part: 3 of 9 frames)"
 
 
-def test_tables_read_each_outcome_a_fixed_number_of_times(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tables_read_each_outcome_a_fixed_number_of_times() -> None:
     """The tables are made after each run of a batch, which can have thousands."""
     reads = 0
 

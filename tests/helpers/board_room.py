@@ -7,7 +7,7 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from helpers.sparse_maps import no_features
+from helpers.sparse_maps import no_features, uniform
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.keyframe import Keyframe
@@ -19,15 +19,11 @@ RATE = 30.0
 BOARDS = 10
 
 
-def _uniform(*shape: int, seed: int) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-_CENTRE = (_uniform(BOARDS, 2, seed=1) - 0.5) * torch.tensor([2.8, 2.0])
-_HALF = 0.12 + 0.2 * _uniform(BOARDS, 2, seed=2)
-_DISTANCE = 1.3 + 1.0 * _uniform(BOARDS, seed=3)
-_COLOUR = 40 + 180 * _uniform(BOARDS + 1, 3, seed=4)
-_WAVES = 25 * (_uniform(BOARDS + 1, 2, seed=5) - 0.5)
+_CENTRE = (uniform(BOARDS, 2, seed=1) - 0.5) * torch.tensor([2.8, 2.0])
+_HALF = 0.12 + 0.2 * uniform(BOARDS, 2, seed=2)
+_DISTANCE = 1.3 + 1.0 * uniform(BOARDS, seed=3)
+_COLOUR = 40 + 180 * uniform(BOARDS + 1, 3, seed=4)
+_WAVES = 25 * (uniform(BOARDS + 1, 2, seed=5) - 0.5)
 _WALL = 3.5
 
 

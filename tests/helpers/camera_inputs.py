@@ -33,7 +33,8 @@ class _Random(RandomNumbers):
         return valid
 
 
-def _cast(inputs: Inputs, dtype: torch.dtype) -> Inputs:
+def cast(inputs: Inputs, dtype: torch.dtype) -> Inputs:
+    """Convert the floating-point inputs to another dtype."""
     return {name: each.to(dtype) if each.is_floating_point() else each for name, each in inputs.items()}
 
 
@@ -66,7 +67,7 @@ def view(batch: int, count: int, dtype: torch.dtype) -> Inputs:
         "weights": 0.5 + random.uniform(batch, count),
         "valid": random.mask(),
     }
-    return _cast(inputs, dtype)
+    return cast(inputs, dtype)
 
 
 def points_in_view(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -81,7 +82,7 @@ def two_views(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     step = torch.tensor([0.3, -0.1, 0.2, 0.0, 0.0, 0.0], dtype=torch.float64)
     moved = _transform(se3_exp(step + 0.05 * random.normal(batch, 6)), points)
     noise = 0.2 * random.normal(batch, count, 2)
-    return _cast({"uv_a": uv, "uv_b": CAMERA.project(moved) + noise, "K": _K(batch), "valid": random.mask()}, dtype)
+    return cast({"uv_a": uv, "uv_b": CAMERA.project(moved) + noise, "K": _K(batch), "valid": random.mask()}, dtype)
 
 
 def descriptors(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -117,7 +118,7 @@ def bundle(batch: int, count: int, dtype: torch.dtype) -> Inputs:
         "weights": 0.5 + random.uniform(batch, count),
         "valid": random.mask(),
     }
-    return _cast(inputs, dtype)
+    return cast(inputs, dtype)
 
 
 def calibration(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -126,7 +127,7 @@ def calibration(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     seconds, information = torch.full((batch,), 0.02), torch.full((batch,), 2500.0)
     jacobian = 30 * random.normal(batch, count, 2)
     inputs = {"seconds": seconds, "information": information, "readout_jacobian": jacobian}
-    return _cast(inputs, dtype) | bundle(batch, count, dtype)
+    return cast(inputs, dtype) | bundle(batch, count, dtype)
 
 
 def graph(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -148,7 +149,7 @@ def graph(batch: int, count: int, dtype: torch.dtype) -> Inputs:
         "weights": 0.5 + random.uniform(batch, count),
         "valid": random.mask(),
     }
-    return _cast(inputs, dtype)
+    return cast(inputs, dtype)
 
 
 def rolling(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -164,7 +165,7 @@ def rolling(batch: int, count: int, dtype: torch.dtype) -> Inputs:
         "readout_jacobian": random.normal(batch, count, 2),
         "valid": random.mask(),
     }
-    return _cast(inputs, dtype)
+    return cast(inputs, dtype)
 
 
 def trajectories(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -174,7 +175,7 @@ def trajectories(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     T_gc = se3_exp(steps.cumsum(dim=1))
     T_ec = se3_exp(random.normal(batch, 1, 6)) @ T_gc @ se3_exp(0.02 * random.normal(batch, count, 6))
     stamps = (torch.arange(count) / 10).repeat(batch, 1)
-    return _cast({"T_gc": T_gc, "T_ec": T_ec, "stamps": stamps, "valid": random.mask()}, dtype)
+    return cast({"T_gc": T_gc, "T_ec": T_ec, "stamps": stamps, "valid": random.mask()}, dtype)
 
 
 def positions(batch: int, count: int, dtype: torch.dtype) -> Inputs:
@@ -188,14 +189,14 @@ def correspondences(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     random = _Random(batch, count)
     p = random.normal(batch, count, 3)
     q = _transform(se3_exp(random.normal(batch, 6)), p) + 0.01 * random.normal(batch, count, 3)
-    return _cast({"p": p, "q": q, "weights": 0.5 + random.uniform(batch, count), "valid": random.mask()}, dtype)
+    return cast({"p": p, "q": q, "weights": 0.5 + random.uniform(batch, count), "valid": random.mask()}, dtype)
 
 
 def twists(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     """Tangent vectors of rigid motions."""
-    return _cast({"xi": _Random(batch, count).normal(batch, count, 6)}, dtype)
+    return cast({"xi": _Random(batch, count).normal(batch, count, 6)}, dtype)
 
 
 def motions(batch: int, count: int, dtype: torch.dtype) -> Inputs:
     """Rigid motions."""
-    return _cast({"T": se3_exp(_Random(batch, count).normal(batch, count, 6))}, dtype)
+    return cast({"T": se3_exp(_Random(batch, count).normal(batch, count, 6))}, dtype)

@@ -17,6 +17,7 @@ from torch._subclasses import FakeTensorMode
 from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers.camera_inputs import cast
 from helpers.module_cases import CASES, FUNCTION_CASES, Case, Inputs, tensors, without_padding
 from v3d_torch.optim.pose_refinement import refine_pose
 
@@ -247,10 +248,6 @@ def function_of(case: Case) -> Callable[..., object]:
     """The function with few iterations."""
     settings = getattr(case.function, "keywords", {})
     return partial(case.function, iterations=ITERATIONS) if "iterations" in settings else case.function
-
-
-def cast(inputs: Inputs, dtype: torch.dtype) -> Inputs:
-    return {name: each.to(dtype) if each.is_floating_point() else each for name, each in inputs.items()}
 
 
 def on_fake_gpu(inputs: Inputs) -> Inputs:

@@ -29,9 +29,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("variable", [None, "V3D_DATA"])
-def test_home_is_expanded_in_sequence_and_camera_paths(
-    home: Path, monkeypatch: pytest.MonkeyPatch, variable: str | None
-) -> None:
+def test_home_is_expanded_in_sequence_and_camera_paths(monkeypatch: pytest.MonkeyPatch, variable: str | None) -> None:
     if variable is not None:
         monkeypatch.setenv(variable, "~")
     root = "~" if variable is None else None

@@ -159,8 +159,8 @@ def test_map_without_views_can_be_saved_and_loaded_with_any_stride(tmp_path: Pat
 def test_error_names_the_path_that_cannot_be_written(tmp_path: Path) -> None:
     stored = random_map(1)
     file = write_map(tmp_path, stored)
-    with pytest.raises(OutputError, match=r"room\.map: cannot be written"):
-        save_map(file / "room.map", stored.map, stored.views)  # a file is no folder
+    with pytest.raises(OutputError, match=r"room\.map/room\.map: cannot be written"):
+        save_map(file / "room.map", stored.map, stored.views)
 
 
 # --- damaged, foreign and incompatible files

@@ -210,7 +210,7 @@ def test_distances_of_a_room_are_those_to_its_surfaces(room: OccupancyMap) -> No
     assert len(error) > 100 and error.min() > -SIZE and error.median() < SIZE / 2 and error.quantile(0.8) < SIZE
 
 
-def test_distances_are_truncated(scattered: tuple[OccupancyMap, Tensor]) -> None:
+def test_distances_are_truncated() -> None:
     voxels = box_of_voxels((0, 0, 0), (60, 3, 3))
     occupancy = map_of(voxels[:1], voxels[1:])
     far = torch.tensor([[55.5, 1.5, 1.5]]) * SIZE

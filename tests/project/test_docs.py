@@ -107,7 +107,7 @@ def test_pictures_are_outputs_of_the_notebooks() -> None:
         assert (script["IMAGES"] / name).read_bytes() == script["picture"](*source), name
 
 
-def test_index_of_stages_links_every_stage(pages: dict[str, Page]) -> None:
+def test_index_of_stages_links_every_stage() -> None:
     stages = {path.stem for path in (ROOT / "docs" / "stages").glob("*.md")} - {"index"}
     text = (ROOT / "docs" / "stages" / "index.md").read_text(encoding="utf-8")
     assert {match[1] for match in re.finditer(r"\]\((\w+)\.md\)", text)} == stages

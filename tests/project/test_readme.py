@@ -51,9 +51,11 @@ def test_readme_shows_every_command() -> None:
 
 
 @pytest.mark.parametrize(
-    ("page", "words"), DOCUMENTED, ids=[f"{page.stem}: {' '.join(words)}" for page, words in DOCUMENTED]
+    "words",
+    [words for _, words in DOCUMENTED],
+    ids=[f"{page.stem}: {' '.join(words)}" for page, words in DOCUMENTED],
 )
-def test_documented_command_parses(page: Path, words: list[str]) -> None:
+def test_documented_command_parses(words: list[str]) -> None:
     get_command(MODULES[words[0]].app).make_context(words[0], words[1:])  # raises a usage error if it does not parse
 
 

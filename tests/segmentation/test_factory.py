@@ -40,7 +40,7 @@ def test_make_segmenter_creates_the_configured_source(tmp_path: Path) -> None:
     assert isinstance(make({"masks_dir": tmp_path}, source="masks"), MaskFolder)
 
 
-def test_options_of_another_source_are_rejected(tmp_path: Path) -> None:
+def test_options_of_another_source_are_rejected() -> None:
     with pytest.raises(ConfigError, match=r"--weights a\.onnx: not used with segmentation\.source=none; remove it"):
         make({"weights": Path("a.onnx")}, source="none")
     with pytest.raises(ConfigError, match=r"--masks ids: not used with .*=yolo; remove it, or add --segmenter masks"):

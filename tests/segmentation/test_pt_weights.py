@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 import sys
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.unpickled_code import CreatesFile
 from torch import nn
 
 from v3d_torch.errors import WeightsError
@@ -18,28 +18,18 @@ from v3d_torch.segmentation.pt_weights import read_pt_weights
 from v3d_torch.segmentation.weights import sha256_of
 
 
-class Malicious:
-    """Object that creates a folder when a loader without restrictions unpickles it."""
-
-    def __init__(self, victim: Path) -> None:
-        self.victim = victim
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return os.mkdir, (str(self.victim),)
-
-
 @pytest.fixture
 def malicious(tmp_path: Path) -> tuple[Path, Path]:
-    """File that creates a folder when it is loaded without restrictions, and that folder."""
+    """File that creates another file when it is loaded without restrictions, and that file."""
     path, victim = tmp_path / "malicious.pt", tmp_path / "victim"
-    torch.save({"model": Malicious(victim)}, path)
+    torch.save({"model": CreatesFile(victim)}, path)
     return path, victim
 
 
 def test_malicious_file_is_effective_without_restrictions(malicious: tuple[Path, Path]) -> None:
     path, victim = malicious
     torch.load(path, weights_only=False)
-    assert victim.is_dir()
+    assert victim.is_file()
 
 
 def test_names_that_are_not_allowed_are_rejected_despite_correct_checksum(malicious: tuple[Path, Path]) -> None:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import hashlib
 import os
-import threading
 import time
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
+from helpers.http_server import QuietHandler, running_server
 
 from v3d_torch.errors import WeightsError
 from v3d_torch.segmentation import weights
@@ -32,23 +31,13 @@ TINY = PublishedWeights(
 )
 
 
-class QuietHandler(SimpleHTTPRequestHandler):
-    """Handler that serves a folder without logging."""
-
-    def log_message(self, *_: object) -> None:
-        """Ignore the message."""
-
-
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[Path, str]]:
     """Folder on a local web server, and its address."""
     folder = tmp_path / "served"
     folder.mkdir()
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=str(folder)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield folder, f"http://127.0.0.1:{server.server_address[1]}"
-    server.shutdown()
-    server.server_close()
+    with running_server(partial(QuietHandler, directory=str(folder))) as address:
+        yield folder, address
 
 
 @pytest.fixture

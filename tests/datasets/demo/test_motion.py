@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.demo_views import SMALL, render_at, world_points
+from helpers.demo_views import render_at, world_points
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.datasets.demo.motions import attach, bend, interpolate, make_pose, move, point_on, span
 from v3d_torch.datasets.demo.renderer import Renderer
-from v3d_torch.datasets.demo.scene import Scene
 from v3d_torch.datasets.demo.scenes.walking import TRAJECTORY, WALK_SPEED, sway, walk
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
-
-
-@pytest.fixture(scope="module")
-def renderer(walking_scene: Scene) -> Renderer:
-    return Renderer(walking_scene, SMALL)
 
 
 def visible_centroid(renderer: Renderer, time: float, mask_id: int) -> np.ndarray:

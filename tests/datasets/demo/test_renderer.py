@@ -18,11 +18,6 @@ from v3d_torch.datasets.demo.scenes.walking import TRAJECTORY
 from v3d_torch.datasets.demo.sequence import SEED
 
 
-@pytest.fixture(scope="module")
-def renderer(walking_scene: Scene) -> Renderer:
-    return Renderer(walking_scene, SMALL)
-
-
 def test_static_points_of_one_frame_lie_on_the_surfaces_of_another(renderer: Renderer) -> None:
     """Points are transformed by the true poses of both frames."""
     (first, T_w1), (second, T_w2) = ((render_at(renderer, t), TRAJECTORY.pose(t)) for t in (0.3, 0.8))

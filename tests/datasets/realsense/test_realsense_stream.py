@@ -199,7 +199,7 @@ def test_camera_continues_after_it_was_unplugged(monkeypatch: pytest.MonkeyPatch
     assert 0.1 < after[0].stamp - before[-1].stamp < missing + 0.5
 
 
-def test_other_camera_after_an_interruption_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_camera_after_an_interruption_is_an_input_error() -> None:
     first, second = SimulatedDevice(), SimulatedDevice()
     second.serial = "2"
     frames = iter(RealSenseCamera("simulated", lambda: second if first.unplugged.is_set() else first))

@@ -9,10 +9,10 @@ from helpers.corpus.case import (
     Damage,
     Fails,
     Succeeds,
-    Workspace,
     add_options,
     all_of,
     edit,
+    rename,
     replace_text,
     write,
 )
@@ -54,15 +54,6 @@ def negative_fy(source: str) -> Fails:
 def append(text: str) -> Damage:
     """Add lines to ``camera.yaml``."""
     return edit(YAML, lambda content: content + text.encode())
-
-
-def rename(name: str) -> Damage:
-    """Rename the folder of the sequence."""
-
-    def make(place: Workspace) -> None:
-        place.seq = str(place.folder.rename(place.root / name))
-
-    return make
 
 
 CASES = [

@@ -160,6 +160,15 @@ def set_sequence(name: str) -> Damage:
     return make
 
 
+def rename(name: str) -> Damage:
+    """Rename the folder of the sequence."""
+
+    def make(place: Workspace) -> None:
+        place.seq = str(place.folder.rename(place.root / name))
+
+    return make
+
+
 def all_of(*makes: Damage) -> Damage:
     """Combine several changes, applied in this order."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, set_sequence
+from helpers.corpus.case import Case, Damage, Fails, Succeeds, Workspace, add_options, all_of, rename, set_sequence
 from helpers.corpus.recordings import noise
 
 
@@ -15,15 +15,6 @@ def folder(name: str | bytes, *files: str) -> Damage:
         for file in files:
             (path / file).write_text("text")
         place.seq = str(path)
-
-    return make
-
-
-def rename(name: str) -> Damage:
-    """Rename the sequence's folder."""
-
-    def make(place: Workspace) -> None:
-        place.seq = str(place.folder.rename(place.root / name))
 
     return make
 
