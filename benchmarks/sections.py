@@ -285,7 +285,7 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 " better. ID switches in 60 frames in which a person is in view, lower is better. People's pixels in"
                 " the right track: fraction of the true pixels of people that lie in the one track of this person."
                 " ByteTrack, OC-SORT and BoT-SORT are those of the package `trackers`, with the same detections; the"
-                " best of three settings is shown. The best HOTA and IDF1 of a sequence are bold."
+                " better of two settings is shown. The best HOTA and IDF1 of a sequence are bold."
             ),
             tracks_table,
             key="sequence",

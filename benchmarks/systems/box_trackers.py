@@ -21,11 +21,6 @@ SETTINGS: Mapping[str, Mapping[str, Mapping[str, float]]] = {
         "OC-SORT": {"high_conf_det_threshold": 0.25},
         "BoT-SORT": {"high_conf_det_threshold": 0.4, "track_activation_threshold": 0.4},
     },
-    "all scores": {
-        "ByteTrack": {"high_conf_det_threshold": 0.25, "track_activation_threshold": 0.25},
-        "OC-SORT": {"high_conf_det_threshold": 0.25},
-        "BoT-SORT": {"high_conf_det_threshold": 0.25, "track_activation_threshold": 0.25},
-    },
 }
 """Settings of each tracker in addition to its defaults; the benchmark shows the best setting for each sequence."""
 
