@@ -40,5 +40,5 @@ def check_map_is_given(config: Config, load_map: str | None = None) -> None:
     """
     if load_map is None and not config.mapping.enabled:
         raise ConfigError(
-            "mapping.enabled=false (--localise): there is no map to localise in; give one to `run` with --load-map"
+            "mapping.enabled=false: there is no map to localise in; only `run` takes one, with --load-map"
         )

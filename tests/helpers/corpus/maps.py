@@ -89,7 +89,7 @@ CASES = [
     Case(
         "--localise without a map",
         add_options("--localise"),
-        Fails("mapping.enabled=false (--localise): there is no map to localise in; give one to `run` with --load-map"),
+        Fails("mapping.enabled=false: there is no map to localise in; only `run` takes one, with --load-map"),
     ),
     Case(
         "a missing file",
