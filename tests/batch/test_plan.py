@@ -35,7 +35,7 @@ def test_configuration_that_two_paths_name_is_loaded_once(tmp_path: Path, order:
 
 def test_configuration_without_map_is_rejected() -> None:
     check_configs([load_config()])
-    with pytest.raises(ConfigError, match=r"^mapping\.enabled=false: there is no map to localise in"):
+    with pytest.raises(ConfigError, match=r"^mapping\.enabled=false: there is no map to localise in; only `run` takes"):
         check_configs([load_config(), load_config(overrides="mapping.enabled=false")])
 
 

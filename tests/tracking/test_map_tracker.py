@@ -26,10 +26,9 @@ class MappedWall:
 
     def __init__(self, camera: PinholeCamera = CAMERA) -> None:
         self.config, self.camera = Config(), camera
-        everywhere = features(COUNT)  # of a pinhole camera; a lens can see less
-        self.features = everywhere[in_image(camera.distort(everywhere.uv))]
+        self.features = features(COUNT)
         self.map = SparseMap(self.config.mapping, self.config.features, camera)
-        self.first = self.map.insert_keyframe(0, 0.0, EYE, self.features, torch.full((len(self.features),), -1))
+        self.first = self.map.insert_keyframe(0, 0.0, EYE, self.features, torch.full((COUNT,), -1))
 
     def track(self, observed: Features, T_cw: Tensor, depth: Tensor | None = None) -> MapTracking:
         local_map = self.map.select_landmarks(torch.arange(len(self.map.landmarks)))
