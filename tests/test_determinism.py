@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers.first_frames import FirstFrames
-from helpers.threads import torch_threads
+from helpers.library_settings import torch_threads
 
 from v3d_torch import V3DSLAM, load_sequence
 from v3d_torch.config.loading import load_config

@@ -13,6 +13,7 @@ from itertools import product
 
 import pytest
 import torch
+from helpers.library_settings import torch_threads
 from helpers.module_cases import (
     CAMERA,
     CAMERA_CASES,
@@ -27,7 +28,6 @@ from helpers.module_cases import (
     tensors,
     without_padding,
 )
-from helpers.threads import torch_threads
 from torch import Tensor
 from torch.autograd import forward_ad
 

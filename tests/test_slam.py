@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.default_dtype import default_dtype
 from helpers.differences import differences
+from helpers.library_settings import default_dtype
 from helpers.walk_run import CAMERA as WALK_CAMERA
 from helpers.walk_run import CONFIG as WALK_CONFIG
 from helpers.walk_run import Walk, segment_red

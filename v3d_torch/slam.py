@@ -265,9 +265,8 @@ class V3DSLAM(FramePreprocessor):
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
                 self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate(), T_dc)
-        objects = self.classify_motion.apply_corrections(
-            objects
-        )  # corrections of the world since the objects were tracked
+        # The world can have been corrected since the objects were tracked.
+        objects = self.classify_motion.apply_corrections(objects)
         return FrameResult(**vars(objects), **vars(state), T_dc=T_dc)
 
     def flush(self) -> None:
@@ -389,7 +388,7 @@ class V3DSLAM(FramePreprocessor):
         return keyframe
 
     def _predict(self) -> PosePrediction | None:
-        """Predict the motion of the camera; None if it has not been localised in a known map yet."""
+        """Predict the motion of the camera; None if it was not found in a known map yet."""
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.was_found else None
 

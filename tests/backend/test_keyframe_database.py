@@ -12,7 +12,7 @@ import kornia_rs
 import numpy as np
 import pytest
 import torch
-from helpers.threads import faiss_threads
+from helpers.library_settings import faiss_threads
 from torch import Tensor
 
 from v3d_torch.backend.keyframe_database import KeyframeDatabase

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.default_dtype import default_dtype
+from helpers.library_settings import default_dtype
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.threads import torch_threads
+from helpers.library_settings import torch_threads
 
 from v3d_torch.geometry.long_products import sum_products
 

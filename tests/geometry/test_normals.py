@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.default_dtype import default_dtype
+from helpers.library_settings import default_dtype
 from helpers.rooms import CAMERA
 from torch import Tensor
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from helpers.threads import torch_threads
+from helpers.library_settings import torch_threads
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.threads import torch_threads
+from helpers.library_settings import torch_threads
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError

@@ -38,7 +38,7 @@ TWISTS = st.tuples(*[st.floats(-2.0, 2.0)] * 3, *[st.floats(-1.5, 1.5)] * 3)
 @pytest.fixture(autouse=True)
 def every_fourth_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
     """Check every 4th pixel, as with a camera of the usual size."""
-    monkeypatch.setattr(image_scale, "_COARSE_COLUMNS", CAMERA.width // 4)
+    monkeypatch.setattr(image_scale, "_COARSE_STRIDE", 4 * 640 // CAMERA.width)
 
 
 def surface(columns: tuple[int, int], rows: tuple[int, int] = (40, 80), z: float = OBJECT) -> Tensor:

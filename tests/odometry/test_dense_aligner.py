@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import pytest
 import torch
+from helpers.library_settings import torch_threads
 from helpers.rendered_planes import (
     ALL_PIXELS,
     IDENTITY,
@@ -26,7 +27,6 @@ from helpers.rendered_planes import (
     uniform,
     vertical_stripes,
 )
-from helpers.threads import torch_threads
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor

@@ -10,9 +10,8 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from helpers.default_dtype import default_dtype
+from helpers.library_settings import default_dtype, torch_threads
 from helpers.photographs import photograph
-from helpers.threads import torch_threads
 from onnx import TensorProto, helper
 from PIL import Image, ImageDraw
 

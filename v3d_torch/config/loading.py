@@ -73,7 +73,7 @@ def load_config(name: StrPath | None = None, overrides: Iterable[str] = ()) -> C
             valid.
     """
     tree = {} if name is None else _read_yaml(find_config(name))
-    return _apply_overrides(tree, _validate(tree, f"{name}"), overrides)
+    return _apply_overrides(tree, _validate(tree, f"{name}"), overrides, "--set")
 
 
 def override_config(config: Config, overrides: Iterable[str], source: str = "--set") -> Config:
@@ -90,7 +90,7 @@ def override_config(config: Config, overrides: Iterable[str], source: str = "--s
     return _apply_overrides(config.model_dump(), config, overrides, source)
 
 
-def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[str], source: str = "--set") -> Config:
+def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[str], source: str) -> Config:
     for override in [overrides] if isinstance(overrides, str) else overrides:  # a string is an iterable, too
         _apply_override(tree, override)
         config = _validate(tree, source)

@@ -47,13 +47,14 @@ class _Chunks(NamedTuple):
 def _decode_png_compiled(content: bytes, max_pixels: int) -> Pixels:
     width, height, (channels, dtype), compressed = _read_chunks(content, max_pixels)
     pixel_bytes = channels * np.dtype(dtype).itemsize
+    row_bytes = 1 + width * pixel_bytes  # the number of a filter, and the pixels
     try:
-        filtered = deflate.zlib_decompress(compressed, height * (1 + width * pixel_bytes))
+        filtered = deflate.zlib_decompress(compressed, height * row_bytes)
     except deflate.DeflateError as error:
         raise ValueError(str(error)) from error
-    if len(filtered) < height * (1 + width * pixel_bytes):
+    if len(filtered) < height * row_bytes:
         raise ValueError("the image has too few pixels")
-    rows = np.frombuffer(filtered, np.uint8).reshape(height, 1 + width * pixel_bytes)
+    rows = np.frombuffer(filtered, np.uint8).reshape(height, row_bytes)
     pixels = np.empty((height, width * pixel_bytes), np.uint8)
     if not kernels.undo_filters(rows, pixel_bytes, pixels):
         raise ValueError("a row has an unknown filter")

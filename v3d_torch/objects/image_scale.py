@@ -13,9 +13,9 @@ from v3d_torch.geometry.pixel_scale import pixel_scale
 
 _FOCAL_LENGTH = 525.0
 
-_COARSE_COLUMNS = 160
-"""Number of columns of coarse images. Pixels are 2 cm apart at 2.5 m, as dense as the clouds, and masks keep more
-detail than the network's own masks have, with 104 columns by default."""
+_COARSE_STRIDE = 4
+"""Stride of coarse images, pixels of a Kinect. Pixels are 2 cm apart at 2.5 m, as dense as the clouds, and masks have
+160 columns, more than the network's own masks, which have 104 by default."""
 
 
 def coarse_stride(camera: PinholeCamera) -> int:
@@ -24,7 +24,7 @@ def coarse_stride(camera: PinholeCamera) -> int:
     Args:
         camera: Camera of the images.
     """
-    return max(round(camera.width / _COARSE_COLUMNS), 1)
+    return _scale(_COARSE_STRIDE, pixel_scale(camera.width))
 
 
 def scale_to_image(config: ObjectsConfig, camera: PinholeCamera) -> ObjectsConfig:

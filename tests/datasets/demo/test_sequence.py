@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.demo_frames import copy_frames
 from helpers.demo_views import world_points
-from helpers.threads import torch_threads
+from helpers.library_settings import torch_threads
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.config import Config
