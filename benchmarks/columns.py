@@ -6,6 +6,7 @@ GROWTH = {
     "sequence": "sequence",
     "frames": "frames",
     "cpu_ms": "CPU ms per frame",
+    "cpu_ratio": "relative to a new system",
     "memory_mb": "memory, MB",
     "memory_kb_per_frame": "growth, kB per frame",
     "keyframes": "keyframes",

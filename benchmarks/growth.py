@@ -2,17 +2,20 @@
 
 ``python benchmarks/growth.py --seq fr1_rpy --frames 5000`` plays a sequence again and again. After its last frame the
 camera is back at the start, where it has to find itself in the map. A sequence is not played backwards, because a
-rolling shutter would then scan against the direction that the map was made with. A second table has place recognition
-and pose graph alone, on thousands of synthetic keyframes.
+rolling shutter would then scan against the direction that the map was made with. Between the blocks of frames, a new
+system processes the beginning of the sequence in another process: its time shows changes of the speed of the machine,
+which the run takes part in. A second table has place recognition and pose graph alone, on thousands of synthetic
+keyframes.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial, reduce
+from pathlib import Path
 from statistics import median
 
 import columns
@@ -24,6 +27,7 @@ from replay import Replay, again_and_again
 from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from systems.ours import Ours
+from systems.process import measure
 from tables import flat
 from timing import timed
 from torch import Tensor
@@ -35,9 +39,13 @@ from v3d_torch.datasets import RGBDSequence, load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.tables import markdown_row
 from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.slam import V3DSLAM
 
 BLOCKS = 10
 """Number of equal parts of a run, with one row each."""
+
+REFERENCE_FRAMES = 300
+"""Number of frames of the runs of new systems."""
 
 FRACTIONS = (0.1, 0.25, 0.5, 1.0)
 """Fractions of the largest number of keyframes at which place recognition and pose graph are timed."""
@@ -47,11 +55,27 @@ QUERIES = 10
 
 
 @dataclass(frozen=True)
-class Snapshot:
-    """State after a frame: wall and CPU time in seconds, memory, size of the map."""
+class Block:
+    """Measurements of a block of frames.
 
-    wall: float
-    cpu: float
+    Attributes:
+        first: Number of its first frame, from 0.
+        end: Number of the frame after its last one.
+        wall_ms: Wall time per frame, milliseconds.
+        slowest_ms: Largest wall time of a frame, milliseconds.
+        cpu_ms: CPU time of all threads per frame, milliseconds.
+        reference_ms: CPU time per frame of new systems, mean of one before and one after the block, milliseconds.
+        resident_mb: Memory of the process after the block, megabytes.
+        keyframes: Number of keyframes after the block.
+        loops: Number of loops after the block.
+    """
+
+    first: int
+    end: int
+    wall_ms: float
+    slowest_ms: float
+    cpu_ms: float
+    reference_ms: float
     resident_mb: float
     keyframes: int
     loops: int
@@ -70,53 +94,96 @@ class LongRun:
     row: Row
 
 
-def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
-    """Play a sequence again and again, and measure every block of frames."""
+class BlockRecorder:
+    """Measures a run in blocks of frames. Call it after each frame.
+
+    Args:
+        slam: System that processes the frames.
+        frames: Number of frames, at least one for each block.
+        reference: Measures the CPU time of a frame of a new system, milliseconds. The run waits for it.
+
+    Attributes:
+        blocks: Measurements of the blocks so far.
+    """
+
+    def __init__(self, slam: V3DSLAM, frames: int, reference: Callable[[], float]) -> None:
+        self.blocks: list[Block] = []
+        self._slam = slam
+        self._ends = [frames * (block + 1) // BLOCKS for block in range(BLOCKS)]
+        self._reference = reference
+        self._reference_ms = reference()
+        self._start()
+
+    def __call__(self, *_: object) -> None:
+        """Measure the frame that was processed last, and the block that ends with it."""
+        now = time.perf_counter()
+        self._slowest, self._last = max(self._slowest, now - self._last), now
+        if len(self._slam.poses) == self._ends[len(self.blocks)]:
+            self._end_block()
+            self._start()
+
+    def _start(self) -> None:
+        self._wall = self._last = time.perf_counter()
+        self._cpu, self._slowest = time.process_time(), 0.0
+
+    def _end_block(self) -> None:
+        first, end = self.blocks[-1].end if self.blocks else 0, len(self._slam.poses)
+        wall, cpu = self._last - self._wall, time.process_time() - self._cpu
+        before, self._reference_ms = self._reference_ms, self._reference()
+        block = Block(
+            first=first,
+            end=end,
+            wall_ms=1e3 * wall / (end - first),
+            slowest_ms=1e3 * self._slowest,
+            cpu_ms=1e3 * cpu / (end - first),
+            reference_ms=(before + self._reference_ms) / 2,
+            resident_mb=resident_mb(),
+            keyframes=len(self._slam.map.active_keyframes),
+            loops=self._slam.loop_closer.loop_count,
+        )
+        self.blocks.append(block)
+
+
+def measure_long_run(sequence: RGBDSequence, frames: int, reference: Callable[[], float]) -> LongRun:
+    """Play a sequence again and again, and measure every block of frames.
+
+    Args:
+        sequence: Sequence to play.
+        frames: Number of frames.
+        reference: See `BlockRecorder`.
+    """
     system = Ours(Replay(sequence, again_and_again(len(sequence), frames)), "v3d_torch", seed=0)
-    slam = system.slam
-
-    def take_snapshot() -> Snapshot:
-        keyframes = len(slam.map.active_keyframes)
-        return Snapshot(time.perf_counter(), time.process_time(), resident_mb(), keyframes, slam.loop_closer.loop_count)
-
-    snapshots = [take_snapshot()]
-    system(lambda *_: snapshots.append(take_snapshot()))
-    times = system.pipeline.record.times
-    columns = ["frames", "ms per frame", "slowest", "CPU ms per frame", "resident MB", "keyframes", "loops"]
+    recorder = BlockRecorder(system.slam, frames, reference)
+    system(recorder)
+    blocks, times = recorder.blocks, system.pipeline.record.times
+    headings = ["frames", "ms per frame", "slowest", "CPU ms per frame", "CPU ms of a new system"]
+    headings += ["resident MB", "keyframes", "loops"]
     lines = [
-        markdown_row([*columns, *(f"{stage} ms" for stage in times.stages)]),
-        markdown_row(["---:"] * (len(columns) + len(times.stages))),
+        markdown_row([*headings, *(f"{stage} ms" for stage in times.stages)]),
+        markdown_row(["---:"] * (len(headings) + len(times.stages))),
     ]
-    cpu_ms: list[str] = []
-    ends: list[Snapshot] = []
-    for block in range(BLOCKS):
-        first, end = frames * block // BLOCKS, frames * (block + 1) // BLOCKS
-        if first == end:
-            continue
-        start, stop = snapshots[first], snapshots[end]
-        slowest = max(snapshots[i + 1].wall - snapshots[i].wall for i in range(first, end))
-        cpu_ms.append(f"{1e3 * (stop.cpu - start.cpu) / (end - first):.1f}")
-        ends.append(stop)
+    for block in blocks:
         cells = [
-            f"{first + 1}-{end}",
-            f"{1e3 * (stop.wall - start.wall) / (end - first):.1f}",
-            f"{1e3 * slowest:.0f}",
-            cpu_ms[-1],
-            f"{stop.resident_mb:.0f}",
-            str(stop.keyframes),
-            str(stop.loops),
-            *(f"{1e3 * seconds:.1f}" for seconds in times.wall[first:end].mean(dim=0).tolist()),
+            f"{block.first + 1}-{block.end}",
+            f"{block.wall_ms:.1f}",
+            f"{block.slowest_ms:.0f}",
+            f"{block.cpu_ms:.1f}",
+            f"{block.reference_ms:.1f}",
+            f"{block.resident_mb:.0f}",
+            str(block.keyframes),
+            str(block.loops),
+            *(f"{1e3 * seconds:.1f}" for seconds in times.wall[block.first : block.end].mean(dim=0).tolist()),
         ]
         lines.append(markdown_row(cells))
-    early, late = ends[0], ends[-1]
-    later = frames - frames // BLOCKS
+    early, late = blocks[0], blocks[-1]
     summary = {
         "sequence": table_name(sequence),
         "frames": str(frames),
-        "cpu_ms": ", ".join(cpu_ms),
+        "cpu_ms": ", ".join(f"{block.cpu_ms:.1f}" for block in blocks),
+        "cpu_ratio": ", ".join(f"{block.cpu_ms / block.reference_ms:.2f}" for block in blocks),
         "memory_mb": f"{early.resident_mb:.0f} to {late.resident_mb:.0f}",
-        "memory_kb_per_frame": f"{1e3 * (late.resident_mb - early.resident_mb) / later:.0f}",
-        "keyframes": f"{min(end.keyframes for end in ends)} to {max(end.keyframes for end in ends)}",
+        "memory_kb_per_frame": f"{1e3 * (late.resident_mb - early.resident_mb) / (frames - early.end):.0f}",
+        "keyframes": f"{min(block.keyframes for block in blocks)} to {max(block.keyframes for block in blocks)}",
         "loops": str(late.loops),
     }
     return LongRun(lines, summary)
@@ -125,6 +192,12 @@ def measure_long_run(sequence: RGBDSequence, frames: int) -> LongRun:
 def resident_mb() -> float:
     """Return the memory of this process, megabytes."""
     return psutil.Process().memory_info().rss / 1e6
+
+
+def measure_new_system(source: str, data_root: Path) -> float:
+    """Return the CPU time per frame of a new system at the beginning of a sequence, milliseconds."""
+    measured = measure("v3d_torch", source, data_root, frames=REFERENCE_FRAMES)
+    return 1e3 * measured.cpu_seconds / measured.frames
 
 
 def measure_keyframes(max_count: int) -> Iterator[Row]:
@@ -201,8 +274,9 @@ def main() -> None:
         parser.error(f"give at least --frames {BLOCKS} and --keyframes {QUERIES}")
     heading = make_heading()
     try:
-        sequence = load_sequence(locate_sequence(options.seq, options.data_root), data_root=options.data_root)
-        run = measure_long_run(sequence, options.frames)
+        source = locate_sequence(options.seq, options.data_root)
+        sequence = load_sequence(source, data_root=options.data_root)
+        run = measure_long_run(sequence, options.frames, partial(measure_new_system, source, options.data_root))
     except V3DError as error:
         parser.error(str(error))
     rows = list(measure_keyframes(options.keyframes))

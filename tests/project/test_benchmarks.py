@@ -17,6 +17,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.pipeline import Pipeline
+from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame
@@ -260,6 +261,22 @@ class TestTables:
 def test_pose_graph_closes_drifting_ring() -> None:
     cells = growth.close_ring(60, torch.Generator().manual_seed(0))
     assert int(cells["iterations"]) > 0 and float(cells["error_after"]) < float(cells["error_before"])
+
+
+def test_blocks_of_a_long_run_are_measured_between_new_systems() -> None:
+    slam = V3DSLAM(PinholeCamera(50.0, 50.0, 32.0, 24.0, 64, 48), NoSegmentation())
+    poses: list[int] = []
+    slam.poses = poses  # type: ignore[assignment]  # only their number is needed
+    times = iter(range(2, 100, 2))
+    recorder = growth.BlockRecorder(slam, 25, lambda: float(next(times)))
+    for frame in range(25):
+        poses.append(frame)
+        recorder()
+    blocks = recorder.blocks
+    assert [block.first for block in blocks] == [0, *(block.end for block in blocks[:-1])]
+    assert [block.end for block in blocks] == [2, 5, 7, 10, 12, 15, 17, 20, 22, 25]
+    assert [block.reference_ms for block in blocks] == [3.0 + 2 * block for block in range(10)]
+    assert all(0 < block.slowest_ms <= (block.end - block.first) * block.wall_ms * (1 + 1e-9) for block in blocks)
 
 
 def test_costs_of_an_occupancy_map_are_measured_beside_octomap(moment: Path) -> None:
