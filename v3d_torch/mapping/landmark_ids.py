@@ -107,4 +107,4 @@ def compacted_ids(in_use: Tensor) -> Tensor:
 
 def _stored_ids(tables: MapTables) -> list[Tensor]:
     """Landmark IDs stored in the map, -1 for none."""
-    return [tables.observations["landmark"], *(keyframe.landmarks for keyframe in tables.keyframes)]
+    return [tables.observations["landmark"], *(keyframe.landmarks for keyframe in tables.active_keyframes)]

@@ -187,7 +187,7 @@ class SparseMap(MapTables):
         change = readout.seconds - self.readout.seconds
         self.readout = readout
         self.observations["uv"].add_(self.observations["readout_jacobian"], alpha=change)
-        for keyframe in self.keyframes:
+        for keyframe in self.active_keyframes:
             features = keyframe.features
             keyframe.features = replace(features, uv=features.uv + change * features.readout_jacobian)
 
