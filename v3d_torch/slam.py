@@ -24,6 +24,7 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.feature_support import FeatureSupport
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.image_scale import scale_to_image
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
@@ -178,6 +179,11 @@ class V3DSLAM(FramePreprocessor):
         return self.config.segmentation.source != "none"
 
     @property
+    def _has_objects(self) -> bool:
+        """False in the baseline without masks."""
+        return self._proposes_objects or not isinstance(innermost_segmenter(self.segment), NoSegmentation)
+
+    @property
     def _floor(self) -> Floor | None:
         return None if self.occupancy is None else self.occupancy.floor
 
@@ -223,24 +229,8 @@ class V3DSLAM(FramePreprocessor):
             features = self._compensate(preprocessed.extraction.features, preprocessed, velocity)
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
-        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
-            was_lost = self.poses.status is TrackingStatus.LOST
-            delay = frame.depth_delay + self.camera.depth_delay
-            T_dc = se3_exp(motion.velocity * delay)  # from the time of the colour image to that of the depth image
-            T_dw = T_dc @ self._compose_pose(motion)
-            view = self.free_space_check.make_view(frame.stamp, depth, T_dw, is_motion_measured=motion.is_measured)
-            newly_occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
-        segmentation = self._wait_for_segmentation(preprocessed)  # III-A
-        with self.timer("free_space"):
-            instances = self._complete_instances(segmentation.instances, view, newly_occupied)
-        with self.timer("clouds"):  # III-B.2: instance clouds without outliers
-            clouds = self.back_project_instances(depth, instances)
-            is_propagated = instances.track_ids is not None  # their ids are known without a comparison
-            appearance = None if is_propagated else self.describe_appearance(frame.image, clouds.cloud_pixels)
-        with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
-            residuals = motion.residuals(self._previous, features, self.camera)
-            support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)), residuals)
-            objects = self.classify_motion(instances, clouds, view, newly_occupied, support, appearance)
+        T_dc = se3_exp(motion.velocity * (frame.depth_delay + self.camera.depth_delay))
+        objects, view = self._track_objects(preprocessed, features, motion, T_dc)  # III-A to III-D
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
@@ -253,8 +243,7 @@ class V3DSLAM(FramePreprocessor):
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
-            has_objects = self._proposes_objects or not isinstance(innermost_segmenter(self.segment), NoSegmentation)
-            if has_objects and pose.status is not TrackingStatus.LOST:
+            if view is not None and pose.status is not TrackingStatus.LOST:
                 self.free_space_check.add_view(view, T_dc @ self.poses.T_cw)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
@@ -268,6 +257,42 @@ class V3DSLAM(FramePreprocessor):
         # The world can have been corrected since the objects were tracked.
         objects = self.classify_motion.apply_corrections(objects)
         return FrameResult(**vars(objects), **vars(state), T_dc=T_dc)
+
+    def _track_objects(
+        self, preprocessed: PreprocessedFrame, features: Features, motion: CameraMotion, T_dc: Tensor
+    ) -> tuple[FrameObjects, DepthView | None]:
+        """Track the objects of a frame and classify their motion.
+
+        Args:
+            preprocessed: The frame.
+            features: Its features, compensated.
+            motion: Motion of the camera since the previous frame.
+            T_dc: Motion of the camera from the time of the colour image to that of the depth image, float64, (4, 4).
+
+        Returns:
+            Objects and static mask, and the view for the free-space check; no objects and None in the baseline without
+            masks.
+        """
+        frame, depth = preprocessed.frame, preprocessed.extraction.depth
+        if not self._has_objects:
+            self._wait_for_segmentation(preprocessed)
+            return FrameObjects.none(*depth.shape[-2:]), None
+        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
+            was_lost = self.poses.status is TrackingStatus.LOST
+            T_dw = T_dc @ self._compose_pose(motion)
+            view = self.free_space_check.make_view(frame.stamp, depth, T_dw, is_motion_measured=motion.is_measured)
+            newly_occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
+        segmentation = self._wait_for_segmentation(preprocessed)  # III-A
+        with self.timer("free_space"):
+            instances = self._complete_instances(segmentation.instances, view, newly_occupied)
+        with self.timer("clouds"):  # III-B.2: instance clouds without outliers
+            clouds = self.back_project_instances(depth, instances)
+            is_propagated = instances.track_ids is not None  # their ids are known without a comparison
+            appearance = None if is_propagated else self.describe_appearance(frame.image, clouds.cloud_pixels)
+        with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
+            residuals = motion.residuals(self._previous, features, self.camera)
+            support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)), residuals)
+            return self.classify_motion(instances, clouds, view, newly_occupied, support, appearance), view
 
     def flush(self) -> None:
         """Apply the pending result of the back end. `track` does this in every frame; call it after the last frame."""

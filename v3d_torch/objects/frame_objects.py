@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+import torch
 from torch import Tensor
 
 from v3d_torch.objects.object_state import ObjectState
@@ -85,6 +86,12 @@ class FrameObjects:
     static_mask: Tensor
     static_without_people: Tensor
     vote_pairs: list[tuple[int, int]]
+
+    @classmethod
+    def none(cls, height: int, width: int) -> FrameObjects:
+        """Return the result for a frame in which everything is static."""
+        everywhere = torch.ones(height, width, dtype=torch.bool)
+        return cls([], everywhere, everywhere, [])
 
     def boxes(self, up: Tensor) -> dict[int, UprightBox]:
         """Compute the upright box of each object that has a cloud and a centroid, by id.
