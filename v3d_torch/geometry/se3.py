@@ -235,6 +235,11 @@ def _skew(v: Tensor) -> Tensor:
     return hat(torch.cat([v, v], dim=-1))[..., :3, :3]
 
 
+def _adjoint_compiled(T: Tensor) -> Tensor:
+    return torch.from_numpy(kernels.adjoint(to_array(T))) if _is_single(T, 4, 4) else NotImplemented
+
+
+@compiled_by(_adjoint_compiled)
 def adjoint(T: Tensor) -> Tensor:
     r"""Adjoint of rigid motions: :math:`T \exp(\xi) = \exp(\mathrm{Ad}_T\, \xi)\, T`.
 

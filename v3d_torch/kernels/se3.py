@@ -163,7 +163,7 @@ def right_jacobian_inverse(xi: Floats) -> Floats:
     return J
 
 
-@device
+@kernel("(f8[:,::1],)")
 def adjoint(T: Floats) -> Floats:
     """Adjoint of a rigid motion, (6, 6)."""
     A, skew = np.zeros((6, 6)), np.zeros((3, 3))

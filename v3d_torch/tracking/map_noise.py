@@ -61,7 +61,9 @@ class MapNoise:
 
     def _add_unrelated(self, count: int) -> None:
         """Add the keyframes of a loaded map, with independent errors, until there are ``count`` keyframes."""
-        missing, size = max(count - len(self._rows), 0), len(self._covariance)
+        missing, size = count - len(self._rows), len(self._covariance)
+        if missing <= 0:
+            return
         self._rows = torch.cat([self._rows, torch.arange(size, size + missing)])
         self._covariance = torch.block_diag(self._covariance, torch.eye(missing, dtype=torch.float64))
 

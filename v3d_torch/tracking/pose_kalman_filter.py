@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -76,14 +77,14 @@ class PoseKalmanFilter:
             T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
             covariance: Covariance of its right perturbation, float64, shape :math:`(6, 6)`.
         """
-        P = self.covariance
-        gain = torch.linalg.solve(P[:6, :6] + covariance, P[:6]).T
-        correction = gain @ se3_log(invert(self.T_wc) @ T_wc)
+        P, R = self.covariance.numpy(), covariance.numpy()  # NumPy is faster than torch for single matrices
+        gain = np.linalg.solve(P[:6, :6] + R, P[:6]).T
+        correction = torch.from_numpy(gain) @ se3_log(invert(self.T_wc) @ T_wc)
         self.T_wc = orthonormalise(self.T_wc @ se3_exp(correction[:6]))
         self.twist = self.twist + correction[6:]
-        kept = torch.eye(12, dtype=torch.float64)  # Joseph form, which stays symmetric and positive definite
+        kept = np.eye(12)  # Joseph form, which stays symmetric and positive definite
         kept[:, :6] -= gain
-        self.covariance = kept @ P @ kept.T + gain @ covariance @ gain.T
+        self.covariance = torch.from_numpy(kept @ P @ kept.T + gain @ R @ gain.T)
 
     def stop(self) -> None:
         """Set the twist to zero, and add its former value to the uncertainty."""
@@ -114,11 +115,13 @@ def predict_covariance(covariance: Tensor, twist: Tensor, elapsed: float) -> Ten
         twist: Twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
         elapsed: Time, seconds.
     """
-    F = torch.eye(12, dtype=torch.float64)
-    F[:6, :6] = adjoint(se3_exp(-elapsed * twist))
-    F[:6, 6:].diagonal().fill_(elapsed)
-    noise = torch.tensor([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]], dtype=torch.float64)
-    return F @ covariance @ F.T + torch.kron(noise, _TWIST_COVARIANCE)
+    # NumPy is faster than torch for a single matrix.
+    F = np.eye(12)
+    F[:6, :6] = adjoint(se3_exp(-elapsed * twist)).numpy()
+    F[:6, 6:] = elapsed * np.eye(6)
+    density = np.array([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]])
+    noise = density[:, None, :, None] * _TWIST_COVARIANCE.numpy()[:, None]  # the Kronecker product, before reshaping
+    return torch.from_numpy(F @ covariance.numpy() @ F.T + noise.reshape(12, 12))
 
 
 def interpolation_covariances(before: float, after: float) -> tuple[Tensor, Tensor]:

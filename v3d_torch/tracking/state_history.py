@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch import Tensor
 
@@ -20,35 +20,42 @@ _DURATION = 10.0
 """Time for which states are stored, seconds, the same as in the transform buffer of ROS."""
 
 
+class _History(NamedTuple):
+    """States of the last frames, and time and measured motion of the next frame if it is not among them yet."""
+
+    states: tuple[CameraState, ...] = ()
+    next_motion: tuple[float, CameraMotion] | None = None
+
+
 class StateHistory:
     """States of the camera at the last frames. Other threads can read them while one thread appends states."""
 
     def __init__(self) -> None:
-        self._states: tuple[CameraState, ...] = ()  # replaced and never changed, so that threads can read it
+        self._history = _History()  # replaced and never changed, so that threads can read it
 
     def append(self, state: CameraState) -> None:
         """Append the state at a frame, and remove those before the last state that is at least 10 s older.
 
         The last one is kept, because the pose 10 s ago is interpolated between it and the next.
         """
-        first = max(bisect_right(self._states, state.stamp - _DURATION, key=_stamp) - 1, 0)
-        end = bisect_left(self._states, state.stamp, key=_stamp)
-        self._states = (*self._states[first:end], state)
+        states = self._history.states
+        first = max(bisect_right(states, state.stamp - _DURATION, key=_stamp) - 1, 0)
+        end = bisect_left(states, state.stamp, key=_stamp)
+        self._history = _History((*states[first:end], state))
 
     def append_motion(self, stamp: float, motion: CameraMotion) -> None:
-        """Append a state that is known early: the last one, moved by a measured motion.
+        """Append a motion that is known before the state at its frame: until `append`, it moves the last state.
 
-        `append` replaces it with the state at this frame. Its covariance is that of the prediction of the last state,
-        which is larger. A motion that was not measured adds nothing to the prediction.
+        The covariance at the frame is then that of the prediction of the last state, which is larger. A motion that was
+        not measured adds nothing to the prediction.
 
         Args:
             stamp: Time of the new frame, seconds.
             motion: Motion of the camera from the last state to this frame.
         """
-        if self._states and motion.is_measured:
-            last = self._states[-1]
-            T_wc = orthonormalise(last.T_wc @ invert(motion.T_cp))
-            self.append(replace(last.predict(stamp), T_wc=T_wc, twist=-motion.velocity))
+        states = self._history.states
+        if states and motion.is_measured:
+            self._history = _History(states, (stamp, motion))
 
     def at(self, stamp: float) -> CameraState:
         """Return the state at a time.
@@ -63,7 +70,7 @@ class StateHistory:
         Raises:
             InputError: If the time is not finite or before the first stored state, or if no frame has been tracked.
         """
-        states = self._states
+        states = self._known_states()
         if not math.isfinite(stamp):
             raise InputError(f"no state at {stamp} s: the time is not finite")
         if not states:
@@ -84,15 +91,26 @@ class StateHistory:
         Args:
             T_new_old: Transform from the old to the corrected world frame, float64, shape :math:`(4, 4)`.
         """
-        self._states = tuple(replace(state, T_wc=orthonormalise(T_new_old @ state.T_wc)) for state in self._states)
+        states, next_motion = self._history
+        moved = (replace(state, T_wc=orthonormalise(T_new_old @ state.T_wc)) for state in states)
+        self._history = _History(tuple(moved), next_motion)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states."""
-        return {"states": list(self._states)}
+        return {"states": list(self._history.states)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the states of `state_dict`."""
-        self._states = tuple(state["states"])
+        self._history = _History(tuple(state["states"]))
+
+    def _known_states(self) -> tuple[CameraState, ...]:
+        """Return the states of the last frames, with that of the next frame if its motion is known."""
+        states, next_motion = self._history  # read once, because another thread can replace it
+        if next_motion is None:
+            return states
+        (stamp, motion), last = next_motion, states[-1]
+        T_wc = orthonormalise(last.T_wc @ invert(motion.T_cp))
+        return (*states, replace(last.predict(stamp), T_wc=T_wc, twist=-motion.velocity))
 
 
 def _interpolate(a: CameraState, b: CameraState, stamp: float) -> CameraState:
