@@ -27,6 +27,8 @@ from v3d_torch.features.features import Features
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.depth_view import DepthView
+from v3d_torch.objects.frame_objects import FrameObjects
+from v3d_torch.objects.motion_classifier import MotionClassifier
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter, make_segmenter
@@ -69,6 +71,27 @@ def test_moving_regions_become_objects_without_a_network(demo: RGBDSequence) -> 
         result = proposing(demo[index])
         assert baseline(demo[index]).objects == []
     assert result.objects and all(each.label == UNLABELLED for each in result.objects)
+
+
+def test_baseline_calls_object_stages_only_if_they_are_replaced_or_have_hooks(demo: RGBDSequence) -> None:
+    plain, hooked, replaced = (V3DSLAM(demo.camera, config=NO_NETWORK) for _ in range(3))
+    names: list[str] = []
+    hooked.register_stage_hook("classify_motion", lambda name, *_: names.append(name))
+    classify = replaced.classify_motion
+
+    class LeftHalf(MotionClassifier):
+        def __call__(self, *args: Any, **kwargs: Any) -> FrameObjects:
+            objects = classify(*args, **kwargs)
+            return replace(objects, static_mask=objects.static_mask & (torch.arange(demo.camera.width) < 320))
+
+    replaced.classify_motion = LeftHalf(replaced.config.objects, demo.camera)
+    for index in range(3):
+        results = [slam(demo[index]) for slam in (plain, hooked, replaced)]
+        assert torch.equal(results[0].T_wc, results[1].T_wc)
+        assert bool(results[0].static_mask.all()) and bool(results[0].static_without_people.all())
+        assert float(results[2].static_mask.float().mean()) == 0.5
+    assert names == ["classify_motion"] * 3
+    assert {"free_space", "clouds", "objects"}.isdisjoint(plain.timer.times) and "objects" in hooked.timer.times
 
 
 @pytest.mark.parametrize("source", ["yolo", "masks", "none"])

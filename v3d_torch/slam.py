@@ -69,6 +69,9 @@ _STATEFUL = (
 )  # fmt: skip
 """Names of the attributes with state that changes from frame to frame."""
 
+_OBJECT_STAGES = "free_space_check", "back_project_instances", "describe_appearance", "classify_motion"
+"""Names of the stages that find and classify objects."""
+
 
 class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
@@ -180,8 +183,12 @@ class V3DSLAM(FramePreprocessor):
 
     @property
     def _has_objects(self) -> bool:
-        """False in the baseline without masks."""
-        return self._proposes_objects or not isinstance(innermost_segmenter(self.segment), NoSegmentation)
+        """False in the baseline without masks, whose object stages would find nothing: they are not called.
+
+        They are called if any was replaced, or has a hook.
+        """
+        finds_instances = not isinstance(innermost_segmenter(self.segment), NoSegmentation)
+        return self._proposes_objects or finds_instances or self._is_changed(*_OBJECT_STAGES)
 
     @property
     def _floor(self) -> Floor | None:
