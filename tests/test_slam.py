@@ -473,3 +473,15 @@ def test_gravity_from_arrays_is_normalised_and_checked(demo: RGBDSequence) -> No
             RGBDFrame.from_arrays(0, 0.0, image, depth, gravity=wrong)
     with pytest.raises(InputError, match=r"frame 0: the gravity is .*; give a unit vector in the camera frame"):
         V3DSLAM(demo.camera, config=NO_NETWORK)(replace(demo[0], gravity=torch.ones(3, dtype=torch.float64)))
+
+
+def test_state_without_a_part_is_an_error_that_names_it(demo: RGBDSequence) -> None:
+    mapping = load_config(None, ("segmentation.source=none", "occupancy.enabled=true"))
+    plain, with_occupancy = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, config=mapping)
+    plain(demo[0])
+    with pytest.raises(ConfigError, match=r"^the state lacks occupancy; load it with the configuration of its system$"):
+        with_occupancy.load_state_dict(plain.state_dict())
+    assert len(with_occupancy.poses) == 0
+    with pytest.raises(ConfigError, match=r"^the state lacks back_end, .*, up_estimator; load it with"):
+        plain.load_state_dict({})
+    assert len(plain.poses) == 1

@@ -13,6 +13,7 @@ from torch import Tensor
 from v3d_torch.backend.back_end import BackEnd
 from v3d_torch.backend.loop_closer import LoopCloser
 from v3d_torch.config import Config
+from v3d_torch.errors import ConfigError
 from v3d_torch.features.features import Features
 from v3d_torch.frame_result import FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.geometry.camera import PinholeCamera
@@ -327,10 +328,10 @@ class V3DSLAM(FramePreprocessor):
         It can be called from another thread while frames are tracked.
 
         Args:
-            stamp: Time in the clock of the frames, seconds; at most 10 s before the last frame, or later than it.
+            stamp: Time in the clock of the frames, seconds; at most 10 s before the last frame, or a day later than it.
 
         Raises:
-            InputError: If the time is earlier or not finite, or no frame has been tracked.
+            InputError: If the time is earlier, later or not finite, or no frame has been tracked.
         """
         return self.states.at(stamp)
 
@@ -350,8 +351,14 @@ class V3DSLAM(FramePreprocessor):
         """Restore a state of `state_dict`; the results of the next frames are the same as without an interruption.
 
         The objects of the state are shared, not copied.
+
+        Raises:
+            ConfigError: If the state lacks a part, for example because it was saved without an occupancy map.
         """
         components = self._components_with_state()
+        missing = sorted({*components, "previous", "predictions", "segmenter"} - state.keys())
+        if missing:
+            raise ConfigError(f"the state lacks {', '.join(missing)}; load it with the configuration of its system")
         self.back_end.discard()  # it reads the map
         for name, component in components.items():
             component.load_state_dict(state[name])

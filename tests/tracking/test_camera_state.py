@@ -178,6 +178,10 @@ def test_times_that_are_not_kept_are_input_errors() -> None:
             states.at(stamp)
     with pytest.raises(InputError, match=r"only states of the last 10 s are stored, since 9\.800000 s"):
         states.at(9.0)
+    last = states.at(86_419.0)
+    assert float(last.covariance.diagonal().min()) > 1e14 and bool(last.covariance.isfinite().all())
+    with pytest.raises(InputError, match=r"^no state at 1\.7e\+18 s: the last frame is of 19\.900000 s; give a time"):
+        states.at(1.7e18)
 
 
 def test_states_of_a_long_run_are_forgotten() -> None:

@@ -19,6 +19,9 @@ from v3d_torch.tracking.pose_kalman_filter import interpolation_covariances
 _DURATION = 10.0
 """Time for which states are stored, seconds, the same as in the transform buffer of ROS."""
 
+_MAX_PREDICTION = 86_400.0
+"""Maximum time after the last frame, seconds, a day: a later time is one of another clock, or in another unit."""
+
 
 class _History(NamedTuple):
     """States of the last frames, and time and measured motion of the next frame if it is not among them yet."""
@@ -68,7 +71,8 @@ class StateHistory:
             stamp: Time, seconds.
 
         Raises:
-            InputError: If the time is not finite or before the first stored state, or if no frame has been tracked.
+            InputError: If the time is not finite, before the first stored state or a day after the last one, or if no
+                frame has been tracked.
         """
         states = self._known_states()
         if not math.isfinite(stamp):
@@ -79,6 +83,11 @@ class StateHistory:
             raise InputError(
                 f"no state at {stamp:.6f} s: only states of the last {_DURATION:g} s are stored, since"
                 f" {states[0].stamp:.6f} s; give a later time"
+            )
+        if stamp > states[-1].stamp + _MAX_PREDICTION:
+            raise InputError(
+                f"no state at {stamp:.6g} s: the last frame is of {states[-1].stamp:.6f} s; give a time in seconds, in"
+                " the clock of the frames"
             )
         index = bisect_right(states, stamp, key=_stamp) - 1
         if index == len(states) - 1:
