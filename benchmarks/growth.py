@@ -27,7 +27,7 @@ from replay import Replay, again_and_again
 from sequences import locate_sequence, table_name
 from storage import Measurement, Row
 from systems.ours import Ours
-from systems.process import measure
+from systems.process import SystemRunError, measure
 from tables import flat
 from timing import timed
 from torch import Tensor
@@ -277,7 +277,7 @@ def main() -> None:
         source = locate_sequence(options.seq, options.data_root)
         sequence = load_sequence(source, data_root=options.data_root)
         run = measure_long_run(sequence, options.frames, partial(measure_new_system, source, options.data_root))
-    except V3DError as error:
+    except (V3DError, SystemRunError) as error:
         parser.error(str(error))
     rows = list(measure_keyframes(options.keyframes))
     lines = [*heading.lines(), "", f"## {options.seq}, again and again", "", *run.lines]
