@@ -2,10 +2,9 @@
 
 ``python benchmarks/growth.py --seq fr1_rpy --frames 5000`` plays a sequence again and again. After its last frame the
 camera is back at the start, where it has to find itself in the map. A sequence is not played backwards, because a
-rolling shutter would then scan against the direction that the map was made with. Between the blocks of frames, a new
-system processes the beginning of the sequence in another process: its time shows changes of the speed of the machine,
-which the run takes part in. A second table has place recognition and pose graph alone, on thousands of synthetic
-keyframes.
+rolling shutter would then scan against the direction that the map was made with. Before and after each tenth of the
+run, a new system processes the beginning of the sequence in another process: its time shows whether the machine has
+become slower. A second table has place recognition and pose graph alone, on thousands of synthetic keyframes.
 """
 
 from __future__ import annotations

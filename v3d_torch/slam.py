@@ -237,7 +237,8 @@ class V3DSLAM(FramePreprocessor):
             features = self._compensate(preprocessed.extraction.features, preprocessed, velocity)
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
-        T_dc = se3_exp(motion.velocity * (frame.depth_delay + self.camera.depth_delay))
+        delay = frame.depth_delay + self.camera.depth_delay
+        T_dc = se3_exp(motion.velocity * delay)  # from the time of the colour image to that of the depth image
         objects, view = self._track_objects(preprocessed, features, motion, T_dc)  # III-A to III-D
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
@@ -328,7 +329,7 @@ class V3DSLAM(FramePreprocessor):
         It can be called from another thread while frames are tracked.
 
         Args:
-            stamp: Time in the clock of the frames, seconds; at most 10 s before the last frame, or a day later than it.
+            stamp: Time in the clock of the frames, seconds, from 10 s before the last frame to a day after it.
 
         Raises:
             InputError: If the time is earlier, later or not finite, or no frame has been tracked.
@@ -355,12 +356,11 @@ class V3DSLAM(FramePreprocessor):
         Raises:
             ConfigError: If the state lacks a part, for example because it was saved without an occupancy map.
         """
-        components = self._components_with_state()
-        missing = sorted({*components, "previous", "predictions", "segmenter"} - state.keys())
+        missing = sorted(self.state_dict().keys() - state.keys())
         if missing:
             raise ConfigError(f"the state lacks {', '.join(missing)}; load it with the configuration of its system")
         self.back_end.discard()  # it reads the map
-        for name, component in components.items():
+        for name, component in self._components_with_state().items():
             component.load_state_dict(state[name])
         self._previous, self._segmenter_state = state["previous"], state["segmenter"]
         self.predictions = deque(state["predictions"])

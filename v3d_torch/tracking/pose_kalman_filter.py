@@ -120,8 +120,7 @@ def predict_covariance(covariance: Tensor, twist: Tensor, elapsed: float) -> Ten
     F[:6, :6] = adjoint(se3_exp(-elapsed * twist)).numpy()
     F[:6, 6:] = elapsed * np.eye(6)
     density = np.array([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]])
-    noise = density[:, None, :, None] * _TWIST_COVARIANCE.numpy()[:, None]  # the Kronecker product, before reshaping
-    return torch.from_numpy(F @ covariance.numpy() @ F.T + noise.reshape(12, 12))
+    return torch.from_numpy(F @ covariance.numpy() @ F.T + np.kron(density, _TWIST_COVARIANCE.numpy()))
 
 
 def interpolation_covariances(before: float, after: float) -> tuple[Tensor, Tensor]:

@@ -71,8 +71,8 @@ class StateHistory:
             stamp: Time, seconds.
 
         Raises:
-            InputError: If the time is not finite, before the first stored state or a day after the last one, or if no
-                frame has been tracked.
+            InputError: If the time is not finite, before the first stored state or more than a day after the last one,
+                or if no frame has been tracked.
         """
         states = self._known_states()
         if not math.isfinite(stamp):
