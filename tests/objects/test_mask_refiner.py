@@ -56,9 +56,11 @@ def refine(
     if appeared is None:
         appeared = torch.full((1, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
     view = DepthView(0.0, depth, torch.eye(4, dtype=torch.float64))
-    return MaskRefiner([track], view, NewlyOccupied(appeared, STEP), StaticMaskConfig(**mask), CAMERA, SPACING).refine(
-        track
-    )
+    refiner = MaskRefiner([track], view, NewlyOccupied(appeared, STEP), StaticMaskConfig(**mask), CAMERA, SPACING)
+    crop, refined = refiner.refine(track)
+    image = torch.zeros_like(segmented)
+    image[crop] = torch.from_numpy(refined)
+    return image
 
 
 def rows_below_cut(shape: Tensor) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import scipy
+import scipy.optimize  # loaded here: `scipy` alone would load it while the first frame is tracked
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor

@@ -285,10 +285,10 @@ class InstanceTracker(torch.nn.Module):
         """Predict the masks of the missed tracks that may move and are not lost; return these."""
         missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
-        covered = self._covered(predicted.tracks, predicted.masks & pack_masks(has_depth, self._stride), updated)
-        for i, track in enumerate(predicted.tracks):
-            if track in updated:
-                continue
+        tracks = {i: track for i, track in enumerate(predicted.tracks) if track not in updated}
+        coarse_masks = predicted.masks[list(tracks)] & pack_masks(has_depth, self._stride)
+        covered = self._covered(list(tracks.values()), coarse_masks, updated)
+        for (i, track), is_covered in zip(tracks.items(), covered, strict=True):
             if not track.may_move:
                 track.drop_masks()
                 resting.append(track)
@@ -297,7 +297,7 @@ class InstanceTracker(torch.nn.Module):
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
                 track.add_vacancy(stamp, min(stamp - self._last_stamp, _MAX_OBSERVED_TIME))
             has_gone = track.vacant_time > _MAX_VACANT_TIME
-            if has_gone or stamp - track.newest.stamp > self._config.max_missed_time or covered[i]:
+            if has_gone or stamp - track.newest.stamp > self._config.max_missed_time or is_covered:
                 lost.append(track)
                 continue
             mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)
@@ -334,7 +334,7 @@ class InstanceTracker(torch.nn.Module):
         with_centroid = [track for track in updated if track.newest.has_centroid]
         if not with_centroid or not tracks:
             return [False] * len(tracks)
-        surfaces = pack_masks(torch.stack([other.cloud_pixels for other in with_centroid]), self._stride)
+        surfaces = torch.stack([pack_masks(other.cloud_pixels, self._stride) for other in with_centroid])
         common = count_common_pixels(coarse_masks, surfaces)
         is_over = common > self._config.min_overlap * count_pixels(coarse_masks)[:, None]
         same_class = torch.tensor([[track.label == other.label for other in with_centroid] for track in tracks])

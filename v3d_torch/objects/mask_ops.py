@@ -1,4 +1,4 @@
-"""Operations on image masks: values at pixels, subsampling, nearest-neighbour upsampling and dilation.
+"""Operations on image masks: values at pixels, cropping, subsampling, nearest-neighbour upsampling and dilation.
 
 NumPy copies bytes several times faster here than torch.
 """
@@ -17,6 +17,9 @@ from torch import Tensor
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 
+Crop = tuple[slice, slice]
+"""Rows and columns of a part of an image; those beyond its last ones do not count."""
+
 _MAX_COMPILED_RADIUS = 254
 """Maximum radius of the compiled dilation, pixels: the kernel stores distances up to the radius plus one as uint8."""
 
@@ -30,6 +33,23 @@ def look_up(masks: Sequence[Tensor], pixel: Tensor) -> Tensor:
     """
     index = (pixel[:, 1] * masks[0].shape[1] + pixel[:, 0]).numpy()
     return torch.from_numpy(np.stack([mask.numpy().take(index) for mask in masks]))
+
+
+def crop_around(mask: NDArray[np.uint8], margin: int, step: int = 1) -> Crop | None:
+    """Return the rows and columns within a margin of the pixels of a mask; None for an empty mask.
+
+    Args:
+        mask: Mask of 0 and 1, shape :math:`(H, W)`.
+        margin: Margin, pixels.
+        step: The rows and columns begin and end at multiples of this.
+    """
+    left, top, width, height = cv2.boundingRect(mask)
+    return (_interval(top, height, margin, step), _interval(left, width, margin, step)) if width else None
+
+
+def _interval(first: int, count: int, margin: int, step: int) -> slice:
+    begin, end = max(first - margin, 0), first + count + margin
+    return slice(begin // step * step, -(-end // step) * step)
 
 
 def subsample(images: Tensor, stride: int) -> Tensor:
@@ -69,7 +89,7 @@ def _dilate_compiled(mask: Tensor, pixels: int) -> Tensor:
     if not 0 <= pixels < _MAX_COMPILED_RADIUS:
         return NotImplemented
     source = mask.view(torch.uint8).numpy()
-    crop = _crop(source, pixels)
+    crop = crop_around(source, pixels)
     dilated = np.zeros_like(source)
     if crop is not None:
         dilated[crop] = kernels.dilate(np.ascontiguousarray(source[crop]), _heights(pixels))
@@ -88,19 +108,11 @@ def dilate(mask: Tensor, pixels: int) -> Tensor:
         Dilated mask, bool, shape :math:`(H, W)`.
     """
     source = mask.view(torch.uint8).numpy()
-    crop = _crop(source, pixels)
+    crop = crop_around(source, pixels)
     dilated = np.zeros_like(source)
     if crop is not None:
         dilated[crop] = cv2.dilate(source[crop], ellipse(pixels))
     return torch.from_numpy(dilated).view(torch.bool)
-
-
-def _crop(mask: NDArray[np.uint8], margin: int) -> tuple[slice, slice] | None:
-    """Return the rows and columns within a margin of the pixels of a mask; None for an empty mask."""
-    left, top, width, height = cv2.boundingRect(mask)
-    if not width:
-        return None
-    return slice(max(top - margin, 0), top + height + margin), slice(max(left - margin, 0), left + width + margin)
 
 
 @cache

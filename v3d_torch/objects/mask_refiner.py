@@ -8,8 +8,10 @@ before the object.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -22,9 +24,9 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.mask_ops import dilate, ellipse, subsample, upsample_nearest
+from v3d_torch.objects.mask_ops import Crop, crop_around, dilate, ellipse, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.objects.silhouette import silhouettes
+from v3d_torch.objects.silhouette import CELL_SIZE, silhouettes
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
 from v3d_torch.objects.track import Track, predict_clouds
 
@@ -34,6 +36,18 @@ depth of a structured-light camera."""
 
 _MIN_PART_RADIUS = 8
 """Minimum radius of a part of a mask that is kept because its surface was not there before, pixels."""
+
+
+class RefinedMask(NamedTuple):
+    """Refined mask in the part of the image that contains all of it.
+
+    Attributes:
+        crop: Rows and columns of the part; none if the mask is empty.
+        mask: Pixels of the object there, bool, shape :math:`(h, w)`.
+    """
+
+    crop: Crop
+    mask: NDArray[np.bool_]
 
 
 class MaskRefiner:
@@ -61,6 +75,9 @@ class MaskRefiner:
         self._config = config
         self._newly_occupied = newly_occupied
         self._stride = newly_occupied.stride
+        self._step = math.lcm(self._stride, CELL_SIZE)
+        # Distance that a refined mask reaches beyond the mask; surfaces are grown and filled in steps of the stride.
+        self._reach = max(config.surface_margin, config.depth_margin) + 2 * self._stride
         with_centroid = [track for track in tracks if track.newest.has_centroid]
         clouds = predict_clouds(with_centroid, view.stamp, view.T_cw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
@@ -88,55 +105,72 @@ class MaskRefiner:
         smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
         return smooth & ~(self._concave | self._previously_occupied)
 
-    def refine(self, track: Track) -> Tensor:
-        """Return the refined mask of one of the objects, bool, shape :math:`(H, W)`."""
-        config, depth = self._config, self._view.depth
+    def refine(self, track: Track) -> RefinedMask:
+        """Return the refined mask of one of the objects."""
+        crop = crop_around(track.mask.view(torch.uint8).numpy(), self._reach, self._step)
+        if crop is None:
+            return RefinedMask((slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_))
+        return RefinedMask(crop, self._refine(track, crop))
+
+    def _refine(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
+        """Return the refined mask in a part of the image that contains all of it, shape (h, w)."""
+        config, segmented = self._config, track.mask.numpy()[crop]
         if track not in self._silhouettes:  # too few points for a depth range of the object
             # A predicted mask already agrees with the depth; without points it is the last one.
             is_predicted = track.missed and len(track.newest.cloud) > 0
-            return track.mask if is_predicted else dilate(track.mask, config.depth_margin)
+            return segmented if is_predicted else _dilate(segmented, config.depth_margin)
         silhouette, median_depth = self._silhouettes[track]
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
-        # NumPy combines masks faster here than torch.
-        mask = self._grow_surface(track, silhouette.mask(depth, config.surface_margin, tolerance)).numpy()
+        depth, origin = self._view.depth[:, *crop].contiguous(), (crop[0].start, crop[1].start)
+        reachable = silhouette.mask(depth, config.surface_margin, tolerance, origin=origin)
+        mask = self._grow_surface(track, reachable, crop)
         if track.missed:  # a predicted mask already agrees with the depth
-            mask |= track.mask.numpy()
-            return torch.from_numpy(mask)
-        agreeing = silhouette.mask(depth, config.depth_margin, tolerance).numpy()
-        agreeing |= self._view.missing.numpy()
-        agreeing &= dilate(track.mask, config.depth_margin).numpy()
+            mask |= segmented
+            return mask
+        agreeing = silhouette.mask(depth, config.depth_margin, tolerance, origin=origin).numpy()
+        agreeing |= self._view.missing.numpy()[crop]
+        agreeing &= _dilate(segmented, config.depth_margin)
         mask |= agreeing
-        mask |= track.cloud_pixels.numpy()
-        self._add_new_parts(track, mask)
-        return torch.from_numpy(mask)
+        mask |= track.cloud_pixels.numpy()[crop]
+        self._add_new_parts(mask, segmented, crop)
+        return mask
 
-    def _add_new_parts(self, track: Track, mask: NDArray[np.bool_]) -> None:
+    def _add_new_parts(self, mask: NDArray[np.bool_], segmented: NDArray[np.bool_], crop: Crop) -> None:
         """Add the parts of the network's mask whose surface was not there before to the refined mask, in place.
 
         A network sometimes draws one mask over two people; the second one is not known background.
         """
         stride = self._stride
-        cells = track.mask.numpy()[::stride, ::stride] & ~mask[::stride, ::stride] & self._new_surface
+        cells = segmented[::stride, ::stride] & ~mask[::stride, ::stride] & self._new_surface[self._cells(crop)]
         # Contours are coarse: narrow parts along them are background that was not observed before.
         kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
         parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
         if parts.any():
             pixels = upsample_nearest(parts, stride, mask.shape).numpy()
-            mask |= pixels & track.mask.numpy() & ~self._view.missing.numpy()
+            mask |= pixels & segmented & ~self._view.missing.numpy()[crop]
 
-    def _grow_surface(self, track: Track, reachable: Tensor) -> Tensor:
-        """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (H, W)."""
+    def _grow_surface(self, track: Track, reachable: Tensor, crop: Crop) -> NDArray[np.bool_]:
+        """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (h, w)."""
+        pixels = track.cloud_pixels[crop]
         if self._config.surface_margin == 0:
-            return track.cloud_pixels & reachable
-        stride = self._stride
-        seeds = track.cloud_pixels.numpy()[::stride, ::stride]
-        near = dilate(subsample(track.mask, stride), self._config.surface_margin // stride).numpy()
+            return (pixels & reachable).numpy()
+        stride, cells = self._stride, self._cells(crop)
+        seeds = pixels.numpy()[::stride, ::stride]
+        near = _dilate(track.mask.numpy()[crop][::stride, ::stride], self._config.surface_margin // stride)
         near &= reachable.numpy()[::stride, ::stride]
-        near &= self._growable
-        near |= seeds & ~self._concave
-        return _fill_surfaces(
-            torch.from_numpy(near), track.cloud_pixels, reachable, stride, self._config.min_surface_fraction
-        )
+        near &= self._growable[cells]
+        near |= seeds & ~self._concave[cells]
+        fraction = self._config.min_surface_fraction
+        return _fill_surfaces(torch.from_numpy(near), pixels, reachable, stride, fraction).numpy()
+
+    def _cells(self, crop: Crop) -> Crop:
+        """Return the rows and columns of the coarse images that show a part of the image."""
+        rows, columns = (slice(each.start // self._stride, each.stop // self._stride) for each in crop)
+        return rows, columns
+
+
+def _dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    return dilate(torch.from_numpy(np.ascontiguousarray(mask)), pixels).numpy()
 
 
 def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], tuple[slice, slice]]:

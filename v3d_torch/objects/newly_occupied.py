@@ -27,7 +27,8 @@ class NewlyOccupied:
     @property
     def previously_occupied(self) -> Tensor:
         """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
-        return (self.appeared == 0).any(dim=0) & ~(self.appeared == 1).any(dim=0)
+        appeared = self.appeared.numpy()  # NumPy is faster here than torch
+        return torch.from_numpy((appeared == 0).any(axis=0) & ~(appeared == 1).any(axis=0))
 
     def fractions(self, masks: Sequence[Tensor], min_pixels: int, of_all: Sequence[bool]) -> Tensor:
         """Return the fraction of each object's pixels that appeared.

@@ -20,7 +20,7 @@ from v3d_torch.kernels import silhouette as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.mask_ops import ellipse
 
-_CELL = 4
+CELL_SIZE = 4
 """Side of the cells that collect the depths of a cloud, pixels: smaller than a cell of the network's masks, 6 pixels
 by default."""
 
@@ -55,7 +55,7 @@ def _project_to_cells_compiled(clouds: Sequence[Tensor], camera: PinholeCamera) 
     if any(cloud.requires_grad for cloud in clouds):
         return NotImplemented
     points = [cloud.to(torch.float64).numpy() for cloud in clouds]
-    return [kernels.project_to_cells(each, _MIN_DEPTH, _CELL, camera.intrinsics, camera.bounds) for each in points]
+    return [kernels.project_to_cells(each, _MIN_DEPTH, CELL_SIZE, camera.intrinsics, camera.bounds) for each in points]
 
 
 @compiled_by(_project_to_cells_compiled)
@@ -68,7 +68,7 @@ def _project_to_cells(clouds: Sequence[Tensor], camera: PinholeCamera) -> list[P
     pixels, inside = camera.project_to_image(points, _MIN_DEPTH)
     projected = inside.numpy()
     # Pixel centres lie at integers, so a cell begins half a pixel before its first pixel centre.
-    cells = np.floor((pixels.numpy()[projected] + 0.5) / _CELL).astype(np.int64)
+    cells = np.floor((pixels.numpy()[projected] + 0.5) / CELL_SIZE).astype(np.int64)
     z = points[:, 2].numpy()[projected].astype(np.float32)
     ends = np.concatenate([[0], projected.cumsum()])[np.cumsum([0, *map(len, clouds)])]
     return [(cells[begin:end], z[begin:end]) for begin, end in pairwise(ends.tolist())]
@@ -103,7 +103,7 @@ def _select_pixels_compiled(
         _pixels_of_cells(left, minima.shape[1], stride, width),
     )
     mask = np.zeros((height, width), np.bool_)
-    box, grid = (rows.start, rows.stop, columns.start, columns.stop), (top, left, _CELL, stride)
+    box, grid = (rows.start, rows.stop, columns.start, columns.stop), (top, left, CELL_SIZE, stride)
     no_depth = _NO_DEPTH / 2 if include_missing else 0.0
     kernels.select_pixels(minima, to_array(depth[0]), box, grid, tolerance, no_depth, mask)
     return torch.from_numpy(mask)
@@ -132,8 +132,8 @@ def _select_pixels(
         _pixels_of_cells(top, len(minima), stride, depth.shape[1]),
         _pixels_of_cells(left, minima.shape[1], stride, depth.shape[2]),
     )
-    cell_rows = np.arange(v.start, v.stop) * stride // _CELL - top
-    cell_columns = np.arange(u.start, u.stop) * stride // _CELL - left
+    cell_rows = np.arange(v.start, v.stop) * stride // CELL_SIZE - top
+    cell_columns = np.arange(u.start, u.stop) * stride // CELL_SIZE - left
     # Expand the cells to pixels: columns first, while there are few rows.
     low, high = (
         bound.take(cell_columns, axis=1).take(cell_rows, axis=0)
@@ -169,27 +169,37 @@ class Silhouette:
         self._eroded: dict[int, Minima] = {}  # by radius
 
     def mask(
-        self, depth: Tensor, margin: int, tolerance: float, *, stride: int = 1, include_missing: bool = False
+        self,
+        depth: Tensor,
+        margin: int,
+        tolerance: float,
+        *,
+        stride: int = 1,
+        include_missing: bool = False,
+        origin: tuple[int, int] = (0, 0),
     ) -> Tensor:
         """Return the pixels near the points whose depth lies within the depth range of the surrounding points.
 
         Args:
-            depth: Depth of every n-th pixel, metres, shape :math:`(1, h, w)`; 0 = no measurement.
+            depth: Depth of every n-th pixel of the image or of a part of it, metres, shape :math:`(1, h, w)`; 0 = no
+                measurement.
             margin: Distance from the outermost points up to which pixels are included, pixels.
             tolerance: Tolerance of the depth in front of and behind the surrounding points, metres.
             stride: Step n between the pixels of ``depth``.
             include_missing: Include pixels near the points that have no depth.
+            origin: Row and column of the image at which ``depth`` begins, multiples of the stride and of `CELL_SIZE`.
 
         Returns:
-            Mask of every n-th pixel, bool, shape :math:`(h, w)`; empty if no point is in the image.
+            Mask of the pixels of ``depth``, bool, shape :math:`(h, w)`; empty if no point is in the image.
         """
         if len(self._z) == 0:
             return torch.zeros(depth.shape[1:], dtype=torch.bool)
-        radius = max(round((margin + self._gap) / _CELL), 1)
+        radius = max(round((margin + self._gap) / CELL_SIZE), 1)
         if radius not in self._eroded:
             self._eroded[radius] = self._erode(radius)
-        minima = self._eroded[radius]
-        return _select_pixels(minima, self._first_cell - radius, depth, tolerance, stride, include_missing)
+        top, left = origin
+        first = self._first_cell - radius - (left // CELL_SIZE, top // CELL_SIZE)
+        return _select_pixels(self._eroded[radius], first, depth, tolerance, stride, include_missing)
 
     def _erode(self, radius: int) -> Minima:
         """Return the minima around each cell, also around the empty cells within the radius of the others."""
@@ -223,11 +233,11 @@ class Silhouette:
     def _measured_depth(self, depth: Tensor) -> NDArray[np.float32]:
         """Return the measured depth at each projected point, metres, shape (P,)."""
         _, height, width = depth.shape
-        u, v = np.minimum(_CELL * self._cells + _CELL // 2, (width - 1, height - 1)).T
+        u, v = np.minimum(CELL_SIZE * self._cells + CELL_SIZE // 2, (width - 1, height - 1)).T
         return depth[0].numpy()[v, u]
 
 
 def _pixels_of_cells(first: int, count: int, stride: int, size: int) -> slice:
     """Return the range of every n-th pixel of ``count`` cells that start with the cell ``first``, along one axis."""
-    begin, end = max(-(-first * _CELL // stride), 0), min(-(-(first + count) * _CELL // stride), size)
+    begin, end = max(-(-first * CELL_SIZE // stride), 0), min(-(-(first + count) * CELL_SIZE // stride), size)
     return slice(begin, max(begin, end))

@@ -13,7 +13,7 @@ from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_ops import dilate
-from v3d_torch.objects.mask_refiner import MaskRefiner
+from v3d_torch.objects.mask_refiner import MaskRefiner, RefinedMask
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import Track
 
@@ -58,12 +58,12 @@ def static_masks(
     return StaticMasks(static, static & _outside(list(masks.values()), size, margins.map_dilation))
 
 
-def _outside(masks: list[Tensor], size: torch.Size, dilation: int) -> Tensor:
+def _outside(masks: list[RefinedMask], size: torch.Size, dilation: int) -> Tensor:
     """Return the pixels outside of all dilated masks, bool, shape (H, W)."""
     if not masks:
         return torch.ones(size, dtype=torch.bool)
     covered = np.zeros(size, np.bool_)
-    for mask in masks:
-        covered |= mask.numpy()  # NumPy combines masks faster here than torch
+    for crop, mask in masks:
+        covered[crop] |= mask
     outside = dilate(torch.from_numpy(covered), dilation).numpy()
     return torch.from_numpy(np.logical_not(outside, out=outside))
