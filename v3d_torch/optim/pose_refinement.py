@@ -32,6 +32,7 @@ from v3d_torch.optim.levenberg_marquardt import (
 from v3d_torch.optim.reprojection import (
     INVERSE_DEPTH_SIGMA,
     MIN_DEPTH,
+    Measurements,
     WhitenedMeasurements,
     chi_square,
     perspective,
@@ -40,6 +41,9 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, to_rows
+
+ITERATIONS = 5
+"""Default maximum number of Levenberg-Marquardt steps in a round."""
 
 
 class PoseRefinement(NamedTuple):
@@ -140,7 +144,7 @@ def refine_pose(
     valid: Tensor | None = None,
     *,
     rounds: int = 4,
-    iterations: int = 5,
+    iterations: int = ITERATIONS,
     tolerance: float = POSE_TOLERANCE,
 ) -> PoseRefinement:
     r"""Refine predicted poses, and classify the measurements into inliers and outliers.
@@ -244,6 +248,24 @@ def refine_pose(
     return _cast(PoseRefinement(at.T_cw, found.inliers, problem.chi2(at), information), dtype)
 
 
+def refine_measured_pose(
+    T_cw: Tensor, points: Tensor, measured: Measurements, K: Tensor, *, rounds: int
+) -> PoseRefinement:
+    """Refine one pose from measurements of this package: `refine_pose` without its checks, padding and gradients.
+
+    Args:
+        T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
+        points: Landmark of each measurement, world frame, metres, finite, float64, shape :math:`(N, 3)`.
+        measured: Measurements, finite, float64, with a standard deviation for each.
+        K: Camera matrix without skew, float64, shape :math:`(3, 3)`.
+        rounds: Maximum number of rounds, at least 1.
+    """
+    (scale, offset), thresholds = whiten(measured, K), measured.chi2_threshold
+    weights, valid = torch.ones_like(thresholds), torch.ones_like(thresholds, dtype=torch.bool)
+    columns = _Problem(points, scale, offset, thresholds, weights, valid)
+    return _minimise(T_cw, *columns, rounds=rounds, iterations=ITERATIONS, tolerance=POSE_TOLERANCE)[0]
+
+
 def _is_robust(index: int, rounds: int) -> bool:
     """Check whether a round uses Huber's kernel: the first half of the rounds does."""
     return 2 * index < rounds
@@ -305,7 +327,7 @@ class PoseRefiner(torch.nn.Module):
         inverse_depth_sigma: Tensor | float = INVERSE_DEPTH_SIGMA,
         *,
         rounds: int = 4,
-        iterations: int = 5,
+        iterations: int = ITERATIONS,
         tolerance: float = POSE_TOLERANCE,
     ) -> None:
         super().__init__()
