@@ -1,7 +1,7 @@
 """Speed of the whole system beside other systems on the same frames, as Markdown.
 
 ``python benchmarks/speed.py --seqs fr1_rpy crowd_rpy --runs 5`` runs all systems in turn, in random order, each in
-its own process. `ABOUT` defines the times.
+its own process, and pyorbslam3 before and after each other one. `ABOUT` defines the times.
 """
 
 from __future__ import annotations
@@ -10,8 +10,9 @@ import argparse
 import os
 import random
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from statistics import mean
 
 from command import add_vocabulary_option, make_parser, publish
 from heading import make_heading
@@ -31,28 +32,36 @@ ABOUT = (
     "Each run is a process of its own. Times run from before the first frame is read until the last frame has a pose."
     " They include reading and decoding of the images. They exclude imports, loading of the network or vocabulary,"
     " mapping by ORB-SLAM3's threads and fusion of our dense map after the last frame, and writing of results. CPU time"
-    " is user and system time of all threads. Ratios compare with pyorbslam3's run of the same turn: above 1 means more"
-    " frames per second, or more CPU time. Values are the median [lowest-highest] of the turns."
+    " is user and system time of all threads. Ratios compare with the mean of the two runs of pyorbslam3 just before"
+    " and after, because the speed of a shared machine changes within minutes: above 1 means more frames per second, or"
+    " more CPU time. Values are the median [lowest-highest] of the turns."
 )
 
-Turn = dict[str, Measured | str]
-"""Measurement of each system, or its error message."""
+Turn = list[tuple[str, Measured | str]]
+"""Systems in the order of their runs, each with its measurement or error message: `REFERENCE`, another system,
+`REFERENCE`, the next system, and so on."""
 
 
 def take_turn(sequence: str, options: argparse.Namespace, vocabulary: Path, order: random.Random) -> Turn:
-    """Run every system once, in random order."""
-    turn: Turn = {}
-    for name in order.sample(SYSTEMS, len(SYSTEMS)):
-        load = os.getloadavg()[0]
-        try:
-            source = locate_sequence(sequence, options.data_root)
-            turn[name] = run = measure(name, source, options.data_root, frames=options.frames, vocabulary=vocabulary)
-            result = f"{rate(run):.1f} frames per second, {cpu(run):.1f} CPU ms per frame"
-        except SystemRunError as error:
-            turn[name] = str(error)
-            result = f"failed: {error}"
-        print(f"{sequence}, {name}: {result} (load before it {load:.1f})", file=sys.stderr)
-    return turn
+    """Run every system once, in random order, with runs of the reference before and after it."""
+    others = [name for name in SYSTEMS if name != REFERENCE]
+    names = [REFERENCE]
+    for name in order.sample(others, len(others)):
+        names += [name, REFERENCE]
+    return [(name, run_system(name, sequence, options, vocabulary)) for name in names]
+
+
+def run_system(name: str, sequence: str, options: argparse.Namespace, vocabulary: Path) -> Measured | str:
+    """Run a system, and log its speed; returns the error message of a failed run."""
+    load, run = os.getloadavg()[0], None
+    try:
+        source = locate_sequence(sequence, options.data_root)
+        run = measure(name, source, options.data_root, frames=options.frames, vocabulary=vocabulary)
+        result = f"{rate(run):.1f} frames per second, {cpu(run):.1f} CPU ms per frame"
+    except SystemRunError as error:
+        result = f"failed: {error}"
+    print(f"{sequence}, {name}: {result} (load before it {load:.1f})", file=sys.stderr)
+    return result.removeprefix("failed: ") if run is None else run
 
 
 def rate(run: Measured) -> float:
@@ -65,24 +74,38 @@ def cpu(run: Measured) -> float:
     return 1e3 * run.cpu_seconds / run.frames
 
 
+def runs_of(turns: Sequence[Turn], name: str) -> list[Measured]:
+    """Return the runs of a system that did not fail."""
+    return [run for turn in turns for each, run in turn if each == name and isinstance(run, Measured)]
+
+
+def ratios(turns: Sequence[Turn], name: str, quantity: Callable[[Measured], float]) -> list[float]:
+    """Return a quantity of each run of a system, divided by its mean in the runs of the reference around it."""
+    if name == REFERENCE:
+        return [1.0] * len(runs_of(turns, name))
+    found = []
+    for turn in turns:
+        for index, (each, run) in enumerate(turn):
+            around = runs_of([turn[index - 1 : index + 2 : 2]], REFERENCE)
+            if each == name and isinstance(run, Measured) and around:
+                found.append(quantity(run) / mean(map(quantity, around)))
+    return found
+
+
 def system_rows(turns: Sequence[Turn]) -> Iterator[Row]:
     """Yield a row per system."""
     for name in SYSTEMS:
-        runs = [run for turn in turns if isinstance(run := turn[name], Measured)]
-        pairs = [
-            (run, reference)
-            for turn in turns
-            if isinstance(run := turn[name], Measured) and isinstance(reference := turn[REFERENCE], Measured)
-        ]
+        runs = runs_of(turns, name)
+        attempts = sum(each == name for turn in turns for each, _ in turn)
         yield {
             "system": name,
             "frames": str(runs[0].frames) if runs else "-",
             "fps": format_median_and_range([rate(run) for run in runs], ".1f"),
-            "fps_ratio": format_median_and_range([rate(run) / rate(reference) for run, reference in pairs], ".2f"),
+            "fps_ratio": format_median_and_range(ratios(turns, name, rate), ".2f"),
             "cpu_ms": format_median_and_range([cpu(run) for run in runs], ".1f"),
-            "cpu_ratio": format_median_and_range([cpu(run) / cpu(reference) for run, reference in pairs], ".2f"),
+            "cpu_ratio": format_median_and_range(ratios(turns, name, cpu), ".2f"),
             "coverage": format_median_and_range([poses(run) / run.frames for run in runs], ".0%"),
-            "failed": f"{len(turns) - len(runs)} of {len(turns)}",
+            "failed": f"{attempts - len(runs)} of {attempts}",
         }
 
 
@@ -103,7 +126,7 @@ def poses(run: Measured) -> int:
 def stage_times(turns: Sequence[Turn]) -> Iterator[Row]:
     """Yield a row per system of ours and stage: milliseconds per frame."""
     for name in OURS:
-        runs = [run for turn in turns if isinstance(run := turn[name], Measured)]
+        runs = runs_of(turns, name)
         for stage in dict.fromkeys(stage for run in runs for stage in run.stages):
             times = [1e3 * run.stages[stage] / run.frames for run in runs if stage in run.stages]
             yield {"system": name, "stage": stage, "ms": format_median_and_range(times, ".1f")}
@@ -126,7 +149,7 @@ def file_of(name: str) -> str:
 def failures(turns: Sequence[Turn]) -> Iterator[str]:
     """Yield a line per failed run with its error message."""
     for number, turn in enumerate(turns, start=1):
-        yield from (f"- turn {number}, {name}: {run}" for name, run in turn.items() if isinstance(run, str))
+        yield from (f"- turn {number}, {name}: {run}" for name, run in turn if isinstance(run, str))
 
 
 def arguments() -> argparse.ArgumentParser:

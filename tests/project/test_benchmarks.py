@@ -230,18 +230,29 @@ def test_orbslam3_settings_contain_camera() -> None:
 
 
 class TestTables:
-    def test_ratios_compare_within_a_turn(self) -> None:
-        """Ours is half as fast as the reference in both turns; the second turn is twice as slow for both."""
-        turns: list[speed.Turn] = [dict.fromkeys(speed.SYSTEMS, "broke") for _ in range(2)]
-        for turn, slow in zip(turns, (1, 2), strict=True):
-            turn["pyorbslam3"] = measured(40 / slow, 30 * slow)
-            turn["v3d_torch"] = measured(20 / slow, 90 * slow, read=0.5 * slow)
+    def test_ratios_compare_with_the_runs_of_the_reference_just_before_and_after(self) -> None:
+        """Ours is half as fast as the reference; the machine becomes slower, in and between the turns."""
+        turns: list[speed.Turn] = []
+        for slow in (1, 2):
+            ours = measured(20 / slow, 90 * slow, read=0.5 * slow)
+            before, after = measured(50 / slow, 20 * slow), measured(30 / slow, 40 * slow)
+            end = measured(1 / slow, 900 * slow)
+            turns.append(
+                [
+                    (speed.REFERENCE, before),
+                    ("v3d_torch", ours),
+                    (speed.REFERENCE, after),
+                    ("open3d", "broke"),
+                    (speed.REFERENCE, end),
+                ]
+            )
         rows = {
             cells[1].strip(): [cell.strip() for cell in cells[2:-1]]
             for cells in (line.split("|") for line in speed.speed_table(turns))
         }
         assert rows["v3d_torch"] == ["15.0 [10.0-20.0]", "0.50", "135.0 [90.0-180.0]", "3.00", "0%", "0 of 2"]
         assert rows["open3d"] == ["-", "-", "-", "-", "-", "2 of 2"]
+        assert rows[speed.REFERENCE][1::2] == ["1.00", "1.00", "0 of 6"]
         assert list(speed.stage_table(turns))[2] == "| read | 7.5 [5.0-10.0] | - | - | - |"
         assert "- turn 2, open3d: broke" in list(speed.failures(turns))
 
@@ -371,8 +382,7 @@ class TestPage:
         figures = {"frames": 9, "ate": {"rmse": 0.25}, "fps": 3.0, "coverage": 0.5}
         outcomes = [accuracy.Outcome("walkers_desk", name, 0, figures) for name in ("full", "pyorbslam3")]
         storage.save("accuracy", storage.Measurement(self.HEADING, list(accuracy.accuracy_rows(outcomes))), tmp_path)
-        turn: speed.Turn = dict.fromkeys(speed.SYSTEMS, "broke")
-        turn |= {"pyorbslam3": measured(40, 30), "v3d_torch": measured(20, 90, read=0.5)}
+        turn: speed.Turn = [(speed.REFERENCE, measured(40, 30)), ("v3d_torch", measured(20, 90, read=0.5))]
         cells = {"sequence": "walkers_desk"}
         rows = [cells | row for row in speed.system_rows([turn])]
         storage.save("speed", storage.Measurement(self.HEADING, rows), tmp_path)
@@ -390,7 +400,7 @@ class TestPage:
         assert file in storage.KEYS
 
     def test_table_of_speed_has_a_row_for_every_measured_system(self) -> None:
-        turn: speed.Turn = {name: measured(20, 90) for name in speed.SYSTEMS}
+        turn: speed.Turn = [(name, measured(20, 90)) for name in speed.SYSTEMS]
         rows = [{"sequence": "walkers_desk"} | row for row in speed.system_rows([turn])]
         lines = list(tables.speed_table([storage.Measurement(self.HEADING, rows)]))
         assert len(lines) == 2 + len(speed.SYSTEMS)
