@@ -50,8 +50,7 @@ def main_tables(folder: Path = RESULTS) -> str:
         " real images of people in real rooms. ORB-SLAM3 (PyPI) is pyorbslam3; ORB-SLAM2, ORB-SLAM3 and NGD-SLAM, which"
         " masks people, were built from source. Parameters of v3d_torch were chosen on these sequences; the other"
         " systems have their defaults. The true poses of walkers_room and walkers_crowd are accurate to about 0.03"
-        " m: smaller differences mean little there. `realtime` was measured on another processor than `full`, without"
-        " 8-bit vector instructions.",
+        " m: smaller differences mean little there.",
         "",
         *accuracy_table(accuracy),
         "",
