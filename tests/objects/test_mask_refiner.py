@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import pack_masks
+from v3d_torch.objects import mask_refiner
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.newly_occupied import NewlyOccupied
@@ -164,3 +167,22 @@ def test_second_body_in_the_mask_is_kept_unless_its_surface_was_there_before() -
 def test_narrow_background_along_the_contour_of_a_mask_is_not_kept() -> None:
     refined = refine(depth_of(), beside=10, surface_margin=0, depth_margin=0)
     assert not refined[ROWS.start : CUT, COLUMNS.stop + STEP :].any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("surface", "margin"), [(32, 8), (0, 20), (48, 0), (0, 0), (200, 100)])
+def test_refined_mask_does_not_depend_on_the_part_of_the_image_that_is_examined(
+    seed: int, surface: int, margin: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.integers(0, (CAMERA.height - 60, CAMERA.width - 60), (12, 2)).tolist()
+    boards = [
+        (slice(v, v + 60), slice(u, u + 60), float(z))
+        for (v, u), z in zip(corners, rng.choice([0.0, BODY, BODY + 0.05, 3.0], 12), strict=True)
+    ]
+    appeared = torch.from_numpy(rng.choice([0.0, 1.0, np.nan], (1, CAMERA.height // STEP, CAMERA.width // STEP)))
+    options = {"beside": 30, "surface_margin": surface, "depth_margin": margin}
+    found = refine(depth_of(*boards), appeared, **options)
+    everywhere = slice(0, CAMERA.height), slice(0, CAMERA.width)
+    monkeypatch.setattr(mask_refiner, "crop_around", lambda *_: everywhere)
+    assert found.any() and torch.equal(found, refine(depth_of(*boards), appeared, **options))

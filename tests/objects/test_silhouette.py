@@ -184,6 +184,18 @@ def test_every_nth_pixel_equals_the_full_mask(step: int) -> None:
         assert some.any() and torch.equal(some, all_of_them[::step, ::step])
 
 
+@pytest.mark.parametrize(("rows", "columns"), [((0, 120), (0, 160)), ((36, 84), (52, 108)), ((60, 120), (0, 80))])
+@pytest.mark.parametrize("step", [1, 2, 4])
+def test_mask_of_a_part_of_the_image_is_that_part_of_the_mask(
+    rows: tuple[int, int], columns: tuple[int, int], step: int
+) -> None:
+    depth, part = board_and_wall(), (slice(*rows), slice(*columns))
+    (silhouette,) = silhouettes([points(every=3)], CAMERA, SPACING)
+    found = silhouette.mask(depth[:, *part][:, ::step, ::step], 8, TOLERANCE, stride=step, origin=(rows[0], columns[0]))
+    expected = silhouette.mask(depth, 8, TOLERANCE)[part][::step, ::step]
+    assert found.any() and torch.equal(found, expected)
+
+
 def test_include_missing_adds_near_pixels_without_depth() -> None:
     depth = board_and_wall()
     depth[0, 50:60, 70:80] = 0.0

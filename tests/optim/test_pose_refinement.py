@@ -21,7 +21,7 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.optim.levenberg_marquardt import huber
-from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose
+from v3d_torch.optim.pose_refinement import PoseRefinement, refine_measured_pose, refine_pose
 from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian, reprojection_residuals
 
 
@@ -48,6 +48,14 @@ def test_refined_pose_equals_the_optimum_of_scipy() -> None:
     assert se3_log(refined.T_cw @ invert(expected)).abs().max() < 1e-5
     torch.testing.assert_close(float(refined.chi2[inliers].sum()), 2 * best.cost, rtol=1e-4, atol=0)
     torch.testing.assert_close(refined.information, torch.from_numpy(best.jac.T @ best.jac), rtol=0.05, atol=2e3)
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 4])
+def test_refinement_without_checks_gives_the_same_result(rounds: int) -> None:
+    T_cw, points, measured, _ = measure_landmarks(300, outliers=0.2)
+    expected = refine_pose(perturb(T_cw), points, K=CAMERA.K, **vars(measured), rounds=rounds)
+    found = refine_measured_pose(perturb(T_cw), points, measured, CAMERA.K, rounds=rounds)
+    assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
 
 
 def test_refined_pose_equals_the_optimum_of_gtsam() -> None:
