@@ -46,6 +46,10 @@ _MIN_SUPPORTED_TIME = 0.3
 """The features on a static object fit the camera motion for at least this long, seconds. Between two frames those on a
 person fit it too, if the person walks slowly or along the line of sight."""
 
+_MIN_OWN_FRACTION = 0.5
+"""Minimum fraction of a predicted mask that belongs to no detected object of the class; otherwise the object is not
+visible."""
+
 
 class MotionClassifier:
     """Object stage of a frame: ids, motion states and the static mask.
@@ -247,10 +251,17 @@ def _unions_of_masks(tracks: Sequence[Track], labels: set[int]) -> dict[int, NDA
 
 
 def _visible_mask(track: Track, detected: Mapping[int, NDArray[np.bool_]]) -> Tensor:
-    """Return the visible pixels of an object: a predicted mask without those of detected objects of its class."""
+    """Return the visible pixels of an object: a predicted mask without those of detected objects of its class.
+
+    It is empty if these have most of them: the network has then drawn one mask over several objects, or the object is
+    behind another one.
+    """
     if not track.missed:
         return track.mask
     if not track.visible:
         return torch.zeros_like(track.mask)
     others = detected.get(track.label)
-    return track.mask if others is None else torch.from_numpy(track.mask.numpy() & ~others)
+    if others is None:
+        return track.mask
+    rest = torch.from_numpy(track.mask.numpy() & ~others)
+    return rest if rest.sum() > _MIN_OWN_FRACTION * track.mask.sum() else torch.zeros_like(rest)
