@@ -34,7 +34,7 @@ ABOUT = (
     " mapping by ORB-SLAM3's threads and fusion of our dense map after the last frame, and writing of results. CPU time"
     " is user and system time of all threads. Ratios compare with the mean of the two runs of pyorbslam3 just before"
     " and after, because the speed of a shared machine changes within minutes: above 1 means more frames per second, or"
-    " more CPU time. Values are the median [lowest-highest] of the turns."
+    " more CPU time. Values are the median [lowest-highest] of the runs."
 )
 
 Turn = list[tuple[str, Measured | str]]
@@ -53,15 +53,16 @@ def take_turn(sequence: str, options: argparse.Namespace, vocabulary: Path, orde
 
 def run_system(name: str, sequence: str, options: argparse.Namespace, vocabulary: Path) -> Measured | str:
     """Run a system, and log its speed; returns the error message of a failed run."""
-    load, run = os.getloadavg()[0], None
+    load, source = os.getloadavg()[0], locate_sequence(sequence, options.data_root)
+    run: Measured | str
     try:
-        source = locate_sequence(sequence, options.data_root)
         run = measure(name, source, options.data_root, frames=options.frames, vocabulary=vocabulary)
         result = f"{rate(run):.1f} frames per second, {cpu(run):.1f} CPU ms per frame"
     except SystemRunError as error:
+        run = str(error)
         result = f"failed: {error}"
     print(f"{sequence}, {name}: {result} (load before it {load:.1f})", file=sys.stderr)
-    return result.removeprefix("failed: ") if run is None else run
+    return run
 
 
 def rate(run: Measured) -> float:
@@ -83,13 +84,12 @@ def ratios(turns: Sequence[Turn], name: str, quantity: Callable[[Measured], floa
     """Return a quantity of each run of a system, divided by its mean in the runs of the reference around it."""
     if name == REFERENCE:
         return [1.0] * len(runs_of(turns, name))
-    found = []
-    for turn in turns:
-        for index, (each, run) in enumerate(turn):
-            around = runs_of([turn[index - 1 : index + 2 : 2]], REFERENCE)
-            if each == name and isinstance(run, Measured) and around:
-                found.append(quantity(run) / mean(map(quantity, around)))
-    return found
+    return [
+        quantity(run) / mean(map(quantity, around))
+        for turn in turns
+        for before, (each, run), after in zip(turn, turn[1:], turn[2:], strict=False)
+        if each == name and isinstance(run, Measured) and (around := runs_of([[before, after]], REFERENCE))
+    ]
 
 
 def system_rows(turns: Sequence[Turn]) -> Iterator[Row]:

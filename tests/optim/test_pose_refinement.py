@@ -21,7 +21,7 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.optim.levenberg_marquardt import huber
-from v3d_torch.optim.pose_refinement import PoseRefinement, refine_measured_pose, refine_pose
+from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose, refine_pose_unchecked
 from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian, reprojection_residuals
 
 
@@ -54,7 +54,7 @@ def test_refined_pose_equals_the_optimum_of_scipy() -> None:
 def test_refinement_without_checks_gives_the_same_result(rounds: int) -> None:
     T_cw, points, measured, _ = measure_landmarks(300, outliers=0.2)
     expected = refine_pose(perturb(T_cw), points, K=CAMERA.K, **vars(measured), rounds=rounds)
-    found = refine_measured_pose(perturb(T_cw), points, measured, CAMERA.K, rounds=rounds)
+    found = refine_pose_unchecked(perturb(T_cw), points, measured, CAMERA.K, rounds=rounds)
     assert all(torch.equal(*pair) for pair in zip(found, expected, strict=True))
 
 

@@ -382,7 +382,8 @@ class TestPage:
         figures = {"frames": 9, "ate": {"rmse": 0.25}, "fps": 3.0, "coverage": 0.5}
         outcomes = [accuracy.Outcome("walkers_desk", name, 0, figures) for name in ("full", "pyorbslam3")]
         storage.save("accuracy", storage.Measurement(self.HEADING, list(accuracy.accuracy_rows(outcomes))), tmp_path)
-        turn: speed.Turn = [(speed.REFERENCE, measured(40, 30)), ("v3d_torch", measured(20, 90, read=0.5))]
+        reference = speed.REFERENCE, measured(40, 30)
+        turn: speed.Turn = [reference, ("v3d_torch", measured(20, 90, read=0.5)), reference]
         cells = {"sequence": "walkers_desk"}
         rows = [cells | row for row in speed.system_rows([turn])]
         storage.save("speed", storage.Measurement(self.HEADING, rows), tmp_path)

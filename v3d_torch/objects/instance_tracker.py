@@ -285,10 +285,10 @@ class InstanceTracker(torch.nn.Module):
         """Predict the masks of the missed tracks that may move and are not lost; return these."""
         missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
-        tracks = {i: track for i, track in enumerate(predicted.tracks) if track not in updated}
-        coarse_masks = predicted.masks[list(tracks)] & pack_masks(has_depth, self._stride)
-        covered = self._covered(list(tracks.values()), coarse_masks, updated)
-        for (i, track), is_covered in zip(tracks.items(), covered, strict=True):
+        unmatched = {i: track for i, track in enumerate(predicted.tracks) if track not in updated}
+        coarse_masks = predicted.masks[list(unmatched)] & pack_masks(has_depth, self._stride)
+        covered = self._covered(list(unmatched.values()), coarse_masks, updated)
+        for (i, track), is_covered in zip(unmatched.items(), covered, strict=True):
             if not track.may_move:
                 track.drop_masks()
                 resting.append(track)

@@ -114,7 +114,7 @@ class MaskRefiner:
 
     def _refine(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
         """Return the refined mask in a part of the image that contains all of it, shape (h, w)."""
-        config, segmented = self._config, track.mask.numpy()[crop]
+        config, segmented, cloud_pixels = self._config, track.mask.numpy()[crop], track.cloud_pixels[crop]
         if track not in self._silhouettes:  # too few points for a depth range of the object
             # A predicted mask already agrees with the depth; without points it is the last one.
             is_predicted = track.missed and len(track.newest.cloud) > 0
@@ -123,7 +123,7 @@ class MaskRefiner:
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
         depth, origin = self._view.depth[:, *crop].contiguous(), (crop[0].start, crop[1].start)
         reachable = silhouette.mask(depth, config.surface_margin, tolerance, origin=origin)
-        mask = self._grow_surface(track, reachable, crop)
+        mask = self._grow_surface(segmented, cloud_pixels, reachable, crop)
         if track.missed:  # a predicted mask already agrees with the depth
             mask |= segmented
             return mask
@@ -131,7 +131,7 @@ class MaskRefiner:
         agreeing |= self._view.missing.numpy()[crop]
         agreeing &= _dilate(segmented, config.depth_margin)
         mask |= agreeing
-        mask |= track.cloud_pixels.numpy()[crop]
+        mask |= cloud_pixels.numpy()
         self._add_new_parts(mask, segmented, crop)
         return mask
 
@@ -149,19 +149,20 @@ class MaskRefiner:
             pixels = upsample_nearest(parts, stride, mask.shape).numpy()
             mask |= pixels & segmented & ~self._view.missing.numpy()[crop]
 
-    def _grow_surface(self, track: Track, reachable: Tensor, crop: Crop) -> NDArray[np.bool_]:
+    def _grow_surface(
+        self, segmented: NDArray[np.bool_], cloud_pixels: Tensor, reachable: Tensor, crop: Crop
+    ) -> NDArray[np.bool_]:
         """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (h, w)."""
-        pixels = track.cloud_pixels[crop]
         if self._config.surface_margin == 0:
-            return (pixels & reachable).numpy()
+            return (cloud_pixels & reachable).numpy()
         stride, cells = self._stride, self._cells(crop)
-        seeds = pixels.numpy()[::stride, ::stride]
-        near = _dilate(track.mask.numpy()[crop][::stride, ::stride], self._config.surface_margin // stride)
+        seeds = cloud_pixels.numpy()[::stride, ::stride]
+        near = _dilate(segmented[::stride, ::stride], self._config.surface_margin // stride)
         near &= reachable.numpy()[::stride, ::stride]
         near &= self._growable[cells]
         near |= seeds & ~self._concave[cells]
         fraction = self._config.min_surface_fraction
-        return _fill_surfaces(torch.from_numpy(near), pixels, reachable, stride, fraction).numpy()
+        return _fill_surfaces(torch.from_numpy(near), cloud_pixels, reachable, stride, fraction).numpy()
 
     def _cells(self, crop: Crop) -> Crop:
         """Return the rows and columns of the coarse images that show a part of the image."""
@@ -173,11 +174,10 @@ def _dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     return dilate(torch.from_numpy(np.ascontiguousarray(mask)), pixels).numpy()
 
 
-def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], tuple[slice, slice]]:
+def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], Crop]:
     """Return the number of connected components, and the component of each cell in the returned rows and columns."""
-    # Crop to the region, with a margin of one cell for the final dilation.
-    left, top, width, height = cv2.boundingRect(region)
-    crop = slice(max(top - 1, 0), top + height + 1), slice(max(left - 1, 0), left + width + 1)
+    # Crop to the region, with a margin of one cell for the final dilation; OpenCV needs at least one cell.
+    crop = crop_around(region, 1) or (slice(0, 1), slice(0, 1))
     count, components = cv2.connectedComponents(region[crop], connectivity=4)
     return count, np.asarray(components, np.int32), crop
 

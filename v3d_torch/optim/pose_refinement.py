@@ -248,10 +248,10 @@ def refine_pose(
     return _cast(PoseRefinement(at.T_cw, found.inliers, problem.chi2(at), information), dtype)
 
 
-def refine_measured_pose(
+def refine_pose_unchecked(
     T_cw: Tensor, points: Tensor, measured: Measurements, K: Tensor, *, rounds: int
 ) -> PoseRefinement:
-    """Refine one pose from measurements of this package: `refine_pose` without its checks, padding and gradients.
+    """Refine one pose from measurements that are known to be valid: `refine_pose` without checks and gradients.
 
     Args:
         T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.

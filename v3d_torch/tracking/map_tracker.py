@@ -11,7 +11,7 @@ from v3d_torch.config import FeaturesConfig, TrackingConfig
 from v3d_torch.features.features import Features, sample_depth, to_measurements
 from v3d_torch.features.projection_matcher import LocalMap, ProjectedLandmarks, ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.optim.pose_refinement import PoseRefinement, refine_measured_pose
+from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose_unchecked
 
 _SEARCH_RADIUS = 10.0
 """Search radius around the projection of a landmark, pixels at octave 0; it grows with the octave. The error of a
@@ -122,7 +122,7 @@ class MapTracker:
         if len(features) < config.min_inliers:
             return None
         measured = to_measurements(features, config, self._pyramid)
-        refined = refine_measured_pose(T_cw, points, measured, self._camera.K, rounds=rounds)
+        refined = refine_pose_unchecked(T_cw, points, measured, self._camera.K, rounds=rounds)
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
     def _is_occluded(self, projected: ProjectedLandmarks, depth: Tensor) -> Tensor:
