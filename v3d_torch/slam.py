@@ -253,7 +253,9 @@ class V3DSLAM(FramePreprocessor):
         with self.timer("mapping"):  # III-E: keyframes and landmarks
             keyframe = self._extend_map(frame, static, pose, motion)
             if view is not None and pose.status is not TrackingStatus.LOST:
-                self.free_space_check.add_view(view, T_dc @ self.poses.T_cw)
+                T_dw = T_dc @ self.poses.T_cw
+                self.free_space_check.add_view(view, T_dw)
+                self.classify_motion.static_surfaces.add_view(view, T_dw, objects.static_without_people)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, twist of the camera
@@ -419,6 +421,7 @@ class V3DSLAM(FramePreprocessor):
         is_elsewhere = self.poses.part != part
         if is_elsewhere:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
+            self.classify_motion.static_surfaces.drop_views()
         if pose.status is not TrackingStatus.LOST and T_new_old is None:
             self.classify_motion.tracker.register(invert(pose.T_cw) @ predicted_T_cw, all_tracks=is_elsewhere)
         self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
@@ -434,6 +437,5 @@ class V3DSLAM(FramePreprocessor):
     def _apply_world_correction(self, T_new_old: Tensor | None) -> None:
         """Apply a correction of the map to all other data that is stored in the world frame."""
         if T_new_old is not None:
-            tracker = self.classify_motion.tracker
-            for each in (tracker, self.free_space_check, self.estimate_state, self.states):
+            for each in (self.classify_motion, self.free_space_check, self.estimate_state, self.states):
                 each.apply_world_correction(T_new_old)

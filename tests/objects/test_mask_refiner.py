@@ -7,14 +7,16 @@ import pytest
 import torch
 from torch import Tensor
 
-from v3d_torch.config import StaticMaskConfig, TrackerConfig
+from v3d_torch.config import CloudConfig, FreeSpaceConfig, ObjectsConfig, StaticMaskConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import pack_masks
 from v3d_torch.objects import mask_refiner
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.track import Detection3D, Track
+from v3d_torch.segmentation.coco import PERSON
 
 CAMERA = PinholeCamera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 WALL, BODY = 4.0, 2.0
@@ -40,12 +42,14 @@ def refine(
     missed: bool = False,
     cloud_end: int = CUT,
     beside: int = 0,
+    static: Tensor | None = None,
+    label: int = PERSON,
     **mask: float,
 ) -> Tensor:
     """Return the refined mask of the body.
 
     The mask of the network has the upper part only, and some columns ``beside`` it, whose depth is not in the cloud;
-    the cloud can have more rows.
+    the cloud can have more rows. The pixels ``static`` were a part of the static scene in an earlier view.
     """
     segmented = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     segmented[ROWS.start : CUT, COLUMNS] = True
@@ -55,11 +59,16 @@ def refine(
     pixels = segmented & (depth[0] > 0)
     segmented[ROWS.start : CUT, COLUMNS.stop : COLUMNS.stop + beside] = True
     track = Track(1, 0.0, TrackerConfig(), segmented, pixels, pack_masks(segmented), missed=missed)
+    track.update_label(label, 0.9)
     track.add_detection(Detection3D(0.0, cloud.mean(dim=0).to(torch.float64), cloud))
     if appeared is None:
         appeared = torch.full((1, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
     view = DepthView(0.0, depth, torch.eye(4, dtype=torch.float64))
-    refiner = MaskRefiner([track], view, NewlyOccupied(appeared, STEP), StaticMaskConfig(**mask), CAMERA, SPACING)
+    surfaces = StaticSurfaces(FreeSpaceConfig(), CAMERA)
+    if static is not None:
+        surfaces.add_view(view, view.T_cw, static)
+    config = ObjectsConfig(clouds=CloudConfig(voxel_size=SPACING), static_mask=StaticMaskConfig(**mask))
+    refiner = MaskRefiner([track], view, NewlyOccupied(appeared, STEP), surfaces, config, CAMERA)
     crop, refined = refiner.refine(track)
     image = torch.zeros_like(segmented)
     image[crop] = torch.from_numpy(refined)
@@ -125,6 +134,29 @@ def test_previously_occupied_surface_is_excluded() -> None:
     assert abs(rows_below_cut(refine(depth_of(), appeared, surface_margin=100)) - (160 - CUT)) <= STEP
     appeared[1, 160 // STEP :] = 1.0  # free over the other time span: not static
     assert rows_below_cut(refine(depth_of(), appeared, surface_margin=100)) == ROWS.stop - CUT
+
+
+def test_static_surface_of_an_earlier_view_is_excluded_from_a_person_but_not_from_a_thing() -> None:
+    """A thing that moves now can have been a static surface before."""
+    static = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    static[160:] = True
+    for label, expected in ((PERSON, 160), (56, ROWS.stop)):
+        grown = refine(depth_of(), static=static, label=label, surface_margin=100)
+        assert abs(rows_below_cut(grown) - (expected - CUT)) <= STEP
+
+
+def test_static_surface_is_excluded_within_the_depth_margin_but_not_from_the_mask() -> None:
+    static = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    refined = refine(depth_of(), static=static, surface_margin=0, depth_margin=8)
+    assert rows_below_cut(refined) == 0
+    assert refined[ROWS.start : CUT, COLUMNS].all()
+
+
+def test_static_surface_is_excluded_only_if_the_pose_is_known() -> None:
+    static = torch.ones(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    not_compared = torch.zeros(0, CAMERA.height // STEP, CAMERA.width // STEP, dtype=torch.float64)
+    grown = refine(depth_of(), not_compared, static=static, surface_margin=100)
+    assert rows_below_cut(grown) == ROWS.stop - CUT
 
 
 def test_missing_depth_ends_the_growth() -> None:

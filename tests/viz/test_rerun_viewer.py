@@ -195,8 +195,9 @@ def test_motion_states_have_the_colours_of_the_figures(recorded: tuple[Recording
         boxes = recording.at("/world/camera/image/objects")[index]
         assert boxes["labels"] == ["person 1", "chair 2", "tv 3"]
         assert boxes["class_ids"] == [CLASS_IDS[obj.motion_state] for obj in result.objects]
-        np.testing.assert_allclose(boxes["half_sizes"], 3 * [[30, 30]])
-        np.testing.assert_allclose(boxes["centers"], [[50 + 4 * index, 120], [160, 120], [250, 120]])
+        sides = [[torch.nonzero(obj.mask.any(dim=axis))[[0, -1], 0] for axis in (0, 1)] for obj in result.objects]
+        np.testing.assert_allclose(boxes["half_sizes"], [[(b - a + 1) / 2 for a, b in sizes] for sizes in sides])
+        np.testing.assert_allclose(boxes["centers"], [[(a + b + 1) / 2 for a, b in sizes] for sizes in sides])
         cloud = recording.at("/world/objects")[index]
         points = torch.cat([obj.cloud for obj in result.objects])
         np.testing.assert_allclose(cloud["positions"], points, atol=1e-6)

@@ -3,7 +3,7 @@
 The contours of a network are coarse, and its mask of a person who is partly in the image often misses an arm. Depth
 corrects both. Pixels around a mask belong to the object if their depth agrees with the object's points. A surface that
 continues from there without a depth edge or a concave edge also belongs to the object, unless the surface was there
-before the object.
+before the object. Static surfaces of earlier views do not belong to it, however near they are.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.config import StaticMaskConfig
+from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
@@ -27,8 +27,10 @@ from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_ops import Crop, crop_around, dilate, ellipse, upsample_nearest
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.silhouette import CELL_SIZE, silhouettes
+from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
 from v3d_torch.objects.track import Track, predict_clouds
+from v3d_torch.segmentation.coco import PERSON
 
 _TOLERANCE_GROWTH = 0.01
 """Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
@@ -57,9 +59,9 @@ class MaskRefiner:
         tracks: Tracks of the objects.
         view: Depth and pose of the frame.
         newly_occupied: Newly occupied pixels of the frame.
-        config: Margins and tolerances.
+        static_surfaces: Static surfaces of earlier views.
+        config: Margins and tolerances of the masks, and the spacing of the clouds.
         camera: Camera of the frame.
-        spacing: Spacing of the objects' points, metres.
     """
 
     def __init__(
@@ -67,21 +69,23 @@ class MaskRefiner:
         tracks: Sequence[Track],
         view: DepthView,
         newly_occupied: NewlyOccupied,
-        config: StaticMaskConfig,
+        static_surfaces: StaticSurfaces,
+        config: ObjectsConfig,
         camera: PinholeCamera,
-        spacing: float,
     ) -> None:
+        self._people = [track for track in tracks if track.label == PERSON]
         self._view = view
-        self._config = config
+        self._config = config.static_mask
         self._newly_occupied = newly_occupied
+        self._static_surfaces = static_surfaces
         self._stride = newly_occupied.stride
         self._step = math.lcm(self._stride, CELL_SIZE)
         # Distance that a refined mask reaches beyond the mask; surfaces are grown and filled in steps of the stride.
-        self._reach = max(config.surface_margin, config.depth_margin) + 2 * self._stride
+        self._reach = max(self._config.surface_margin, self._config.depth_margin) + 2 * self._stride
         with_centroid = [track for track in tracks if track.newest.has_centroid]
         clouds = predict_clouds(with_centroid, view.stamp, view.T_cw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
-        projected = silhouettes(clouds, camera, spacing)
+        projected = silhouettes(clouds, camera, config.clouds.voxel_size)
         self._silhouettes = dict(zip(with_centroid, zip(projected, median_depths, strict=True), strict=True))
 
     @cached_property
@@ -100,10 +104,23 @@ class MaskRefiner:
         return ~(self._previously_occupied | self._view.missing.numpy()[:: self._stride, :: self._stride])
 
     @cached_property
-    def _growable(self) -> NDArray[np.bool_]:
-        """Every n-th pixel over which a surface can grow: no edge, and not occupied before the object appeared."""
+    def _continuous(self) -> NDArray[np.bool_]:
+        """Every n-th pixel without an edge whose surface was not there before."""
         smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
         return smooth & ~(self._concave | self._previously_occupied)
+
+    @cached_property
+    def _static_surface(self) -> NDArray[np.bool_]:
+        """Every n-th pixel that a person's mask could reach, and whose surface is a static one of an earlier view."""
+        masks = np.zeros(self._concave.shape, np.bool_)
+        for track in self._people:
+            masks |= track.mask.numpy()[:: self._stride, :: self._stride]
+        if not len(self._newly_occupied.appeared):  # the pose relative to earlier views is not known
+            return np.zeros_like(masks)
+        reachable = _dilate(masks, self._reach // self._stride) & self._continuous
+        reachable |= _dilate(masks, self._config.depth_margin // self._stride + 1)
+        reachable &= ~(masks | self._newly_occupied.is_new.numpy())
+        return self._static_surfaces.find(self._view, torch.from_numpy(reachable), self._stride).numpy()
 
     def refine(self, track: Track) -> RefinedMask:
         """Return the refined mask of one of the objects."""
@@ -123,13 +140,17 @@ class MaskRefiner:
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
         depth, origin = self._view.depth[:, *crop].contiguous(), (crop[0].start, crop[1].start)
         reachable = silhouette.mask(depth, config.surface_margin, tolerance, origin=origin)
-        mask = self._grow_surface(segmented, cloud_pixels, reachable, crop)
+        # A thing that moves now was a static surface before, but views are stored without people.
+        cells = self._cells(crop)
+        static = self._static_surface[cells] & (track.label == PERSON)
+        mask = self._grow_surface(segmented, cloud_pixels, reachable, static, cells)
         if track.missed:  # a predicted mask already agrees with the depth
             mask |= segmented
             return mask
         agreeing = silhouette.mask(depth, config.depth_margin, tolerance, origin=origin).numpy()
         agreeing |= self._view.missing.numpy()[crop]
         agreeing &= _dilate(segmented, config.depth_margin)
+        agreeing &= segmented | ~upsample_nearest(static, self._stride, mask.shape).numpy()
         mask |= agreeing
         mask |= cloud_pixels.numpy()
         self._add_new_parts(mask, segmented, crop)
@@ -150,16 +171,21 @@ class MaskRefiner:
             mask |= pixels & segmented & ~self._view.missing.numpy()[crop]
 
     def _grow_surface(
-        self, segmented: NDArray[np.bool_], cloud_pixels: Tensor, reachable: Tensor, crop: Crop
+        self,
+        segmented: NDArray[np.bool_],
+        cloud_pixels: Tensor,
+        reachable: Tensor,
+        static: NDArray[np.bool_],
+        cells: Crop,
     ) -> NDArray[np.bool_]:
-        """Grow an object's pixels within the reachable ones up to the next edge, bool, shape (h, w)."""
+        """Grow an object's pixels within the reachable ones up to the next edge or static surface, bool, (h, w)."""
         if self._config.surface_margin == 0:
             return (cloud_pixels & reachable).numpy()
-        stride, cells = self._stride, self._cells(crop)
+        stride = self._stride
         seeds = cloud_pixels.numpy()[::stride, ::stride]
         near = _dilate(segmented[::stride, ::stride], self._config.surface_margin // stride)
         near &= reachable.numpy()[::stride, ::stride]
-        near &= self._growable[cells]
+        near &= self._continuous[cells] & ~static
         near |= seeds & ~self._concave[cells]
         fraction = self._config.min_surface_fraction
         return _fill_surfaces(torch.from_numpy(near), cloud_pixels, reachable, stride, fraction).numpy()

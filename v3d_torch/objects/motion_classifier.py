@@ -7,9 +7,7 @@ from dataclasses import replace
 from math import isnan
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
@@ -21,6 +19,7 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedOb
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
 from v3d_torch.objects.mask_propagation import propagate_instances
+from v3d_torch.objects.mask_refiner import MaskRefiner, RefinedMask
 from v3d_torch.objects.motion_evidence import (
     DetectionPairs,
     chamfer_evidence,
@@ -30,7 +29,9 @@ from v3d_torch.objects.motion_evidence import (
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_mask import static_masks
+from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.track import Track
+from v3d_torch.objects.visible_masks import visible_masks
 from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import STAMP_TOLERANCE, Instances
 
@@ -46,10 +47,6 @@ _MIN_SUPPORTED_TIME = 0.3
 """The features on a static object fit the camera motion for at least this long, seconds. Between two frames those on a
 person fit it too, if the person walks slowly or along the line of sight."""
 
-_MIN_OWN_FRACTION = 0.5
-"""Minimum fraction of a predicted mask that belongs to no detected object of the class; otherwise the object is not
-visible."""
-
 
 class MotionClassifier:
     """Object stage of a frame: ids, motion states and the static mask.
@@ -57,6 +54,10 @@ class MotionClassifier:
     Args:
         config: Configuration of the object stage.
         camera: Camera of all frames.
+
+    Attributes:
+        tracker: Tracks of the objects.
+        static_surfaces: Static surfaces of earlier views, to which each view is added once its pose is known.
     """
 
     def __init__(self, config: ObjectsConfig, camera: PinholeCamera) -> None:
@@ -64,6 +65,7 @@ class MotionClassifier:
         self._camera = camera
         self._last_stamp = -torch.inf
         self.tracker = InstanceTracker(config.tracker, camera, config.clouds)
+        self.static_surfaces = StaticSurfaces(config.free_space, camera)
 
     def __call__(
         self,
@@ -118,26 +120,38 @@ class MotionClassifier:
         for track, is_supported in zip(tracks, supported, strict=True):
             track.mark_supported(stamp, is_supported)
         motion_states = {track: self._motion_state(track, free_space.appeared[track], stamp) for track in tracks}
-        detected_masks = _unions_of_masks(detected, {track.label for track in tracks if track.missed and track.visible})
+
+        # Static mask. Most excluded objects are people, and each mask is refined once.
+        excluded = [track for track, motion_state in motion_states.items() if not self._is_trackable(motion_state)]
+        people = [track for track in tracks if track.label == PERSON]
+        refined = self._refined_masks(list(dict.fromkeys([*excluded, *people])), view, newly_occupied)
+        masks = static_masks(
+            [refined[track] for track in excluded], list(refined.values()), view.missing.shape, config.static_mask
+        )
+
         objects = [
             TrackedObject(
                 id=track.id,
                 label=track.label,
-                mask=_visible_mask(track, detected_masks),
+                mask=mask,
                 votes=vote.votes.get(track, 0),
                 chamfer=chamfer.distances.get(track, torch.nan),
-                motion_state=motion_state,
+                motion_state=motion_states[track],
                 missed=track.missed,
                 **_place(track, stamp),
             )
-            for track, motion_state in motion_states.items()
+            for track, mask in zip(tracks, visible_masks(tracks, refined, view.missing), strict=True)
         ]
-
-        # Static mask.
-        excluded = [track for track, motion_state in motion_states.items() if not self._is_trackable(motion_state)]
-        people = [track for track in tracks if track.label == PERSON]
-        masks = static_masks(excluded, people, view, newly_occupied, config, self._camera)
         return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
+
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
+        """Transform the tracks and the stored views into the corrected world.
+
+        Args:
+            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+        """
+        self.tracker.apply_world_correction(T_new_old)
+        self.static_surfaces.apply_world_correction(T_new_old)
 
     def apply_corrections(self, objects: FrameObjects) -> FrameObjects:
         """Return the objects of the last frame in the world frame to which the tracker was corrected since then.
@@ -160,8 +174,9 @@ class MotionClassifier:
         return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state between frames: timestamp of the last frame and state of the tracker."""
-        return {"last_stamp": self._last_stamp, "tracker": self.tracker.state_dict()}
+        """Return the state between frames: timestamp of the last frame, tracks and earlier views."""
+        parts = {"tracker": self.tracker.state_dict(), "static_surfaces": self.static_surfaces.state_dict()}
+        return {"last_stamp": self._last_stamp, **parts}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Replace the state between frames.
@@ -171,6 +186,13 @@ class MotionClassifier:
         """
         self._last_stamp = state["last_stamp"]
         self.tracker.load_state_dict(state["tracker"])
+        self.static_surfaces.load_state_dict(state["static_surfaces"])
+
+    def _refined_masks(
+        self, tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied
+    ) -> dict[Track, RefinedMask]:
+        refiner = MaskRefiner(tracks, view, newly_occupied, self.static_surfaces, self._config, self._camera)
+        return {track: refiner.refine(track) for track in tracks}
 
     def _deformation_candidates(self, pairs: DetectionPairs, stamp: float) -> DetectionPairs:
         """Return the pairs of living objects that are not dynamic: Chamfer distances refine the vote (Sec. I)."""
@@ -242,26 +264,3 @@ class MotionClassifier:
 def _place(track: Track, stamp: float) -> dict[str, Any]:
     """Return the attributes of a `TrackedObject` in the world frame."""
     return {"state": track.predict_visible_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}
-
-
-def _unions_of_masks(tracks: Sequence[Track], labels: set[int]) -> dict[int, NDArray[np.bool_]]:
-    """Return the union of the masks of the tracks of some classes, shape (H, W), by class; without empty classes."""
-    masks = {label: [track.mask.numpy() for track in tracks if track.label == label] for label in labels}
-    return {label: np.logical_or.reduce(of_label) for label, of_label in masks.items() if of_label}
-
-
-def _visible_mask(track: Track, detected: Mapping[int, NDArray[np.bool_]]) -> Tensor:
-    """Return the visible pixels of an object: a predicted mask without those of detected objects of its class.
-
-    It is empty if these have most of them: the network has then drawn one mask over several objects, or the object is
-    behind another one.
-    """
-    if not track.missed:
-        return track.mask
-    if not track.visible:
-        return torch.zeros_like(track.mask)
-    others = detected.get(track.label)
-    if others is None:
-        return track.mask
-    rest = torch.from_numpy(track.mask.numpy() & ~others)
-    return rest if rest.sum() > _MIN_OWN_FRACTION * track.mask.sum() else torch.zeros_like(rest)

@@ -25,10 +25,14 @@ class NewlyOccupied:
     stride: int
 
     @property
+    def is_new(self) -> Tensor:
+        """Pixels whose space was free over some time span, bool, shape :math:`(h, w)`."""
+        return torch.from_numpy((self.appeared.numpy() == 1).any(axis=0))  # NumPy is faster here than torch
+
+    @property
     def previously_occupied(self) -> Tensor:
         """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
-        appeared = self.appeared.numpy()  # NumPy is faster here than torch
-        return torch.from_numpy((appeared == 0).any(axis=0) & ~(appeared == 1).any(axis=0))
+        return torch.from_numpy((self.appeared.numpy() == 0).any(axis=0) & ~self.is_new.numpy())
 
     def fractions(self, masks: Sequence[Tensor], min_pixels: int, of_all: Sequence[bool]) -> Tensor:
         """Return the fraction of each object's pixels that appeared.

@@ -9,13 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v3d_torch.config import ObjectsConfig
-from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.objects.depth_view import DepthView
+from v3d_torch.config import StaticMaskConfig
 from v3d_torch.objects.mask_ops import dilate
-from v3d_torch.objects.mask_refiner import MaskRefiner, RefinedMask
-from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.objects.track import Track
+from v3d_torch.objects.mask_refiner import RefinedMask
 
 
 class StaticMasks(NamedTuple):
@@ -32,33 +28,21 @@ class StaticMasks(NamedTuple):
 
 
 def static_masks(
-    excluded: Sequence[Track],
-    people: Sequence[Track],
-    view: DepthView,
-    newly_occupied: NewlyOccupied,
-    config: ObjectsConfig,
-    camera: PinholeCamera,
+    excluded: Sequence[RefinedMask], all_masks: Sequence[RefinedMask], size: torch.Size, config: StaticMaskConfig
 ) -> StaticMasks:
     """Compute the static mask of a frame, with and without people.
 
     Args:
-        excluded: Objects that tracking must not use.
-        people: People, static or not.
-        view: Depth and pose of the frame.
-        newly_occupied: Newly occupied pixels of the frame.
-        config: Margins and tolerances of the masks, and the spacing of the clouds.
-        camera: Camera of the frame.
+        excluded: Masks of the objects that tracking must not use.
+        all_masks: These masks, and those of the other people.
+        size: Height and width of the image.
+        config: Margins of the masks.
     """
-    # Most excluded objects are people: refine each mask once.
-    tracks = list(dict.fromkeys([*excluded, *people]))
-    refiner = MaskRefiner(tracks, view, newly_occupied, config.static_mask, camera, config.clouds.voxel_size)
-    masks = {track: refiner.refine(track) for track in tracks}
-    size, margins = view.depth.shape[-2:], config.static_mask
-    static = _outside([masks[track] for track in excluded], size, margins.dilation)
-    return StaticMasks(static, static & _outside(list(masks.values()), size, margins.map_dilation))
+    static = _outside(excluded, size, config.dilation)
+    return StaticMasks(static, static & _outside(all_masks, size, config.map_dilation))
 
 
-def _outside(masks: list[RefinedMask], size: torch.Size, dilation: int) -> Tensor:
+def _outside(masks: Sequence[RefinedMask], size: torch.Size, dilation: int) -> Tensor:
     """Return the pixels outside of all dilated masks, bool, shape (H, W)."""
     if not masks:
         return torch.ones(size, dtype=torch.bool)

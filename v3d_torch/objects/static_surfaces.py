@@ -1,0 +1,112 @@
+"""Static surfaces in the views of the last seconds, for the places that people hide now and then.
+
+The free-space check compares a frame with two earlier ones. What a person hid in both is unknown: the floor before the
+feet of a person who walks towards the camera seems as new as the person. Views of the seconds before often show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from v3d_torch.config import FreeSpaceConfig
+from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.depth_view import DepthView, StoredView
+from v3d_torch.objects.free_space_check import is_free_space
+from v3d_torch.types import STAMP_TOLERANCE
+
+_TIME_SPAN = 3.0
+"""Age of the oldest view, seconds: a person who walks by hides a place for less."""
+
+_INTERVAL = 0.5
+"""Time between two views, seconds: a walking person moves by about the width of a person."""
+
+
+class StaticSurfaces:
+    """Views of the last seconds that contain the static scene only.
+
+    Args:
+        config: Range of depths and tolerances; without the free-space check, no surface is known.
+        camera: Camera of all views.
+    """
+
+    def __init__(self, config: FreeSpaceConfig, camera: PinholeCamera) -> None:
+        self._config = config
+        self._camera = camera
+        self._views: list[StoredView] = []
+
+    def find(self, view: DepthView, pixels: Tensor, stride: int) -> Tensor:
+        """Find the pixels whose surface is a static one of an earlier view.
+
+        The newest view that observes the place of a surface decides.
+
+        Args:
+            view: Current view.
+            pixels: Pixels to check, bool, every ``stride``-th pixel, shape :math:`(h, w)`.
+            stride: Step between the pixels, pixels.
+
+        Returns:
+            Bool, shape :math:`(h, w)`.
+        """
+        # NumPy is faster here than torch.
+        rows, columns = np.nonzero(pixels.numpy())
+        source = stride * rows, stride * columns
+        depth = view.depth[0].numpy()[source].astype(np.float64)
+        T_wc = invert(view.T_cw).numpy()
+        points = (self._camera.rays.numpy()[source] * depth[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        found = np.zeros(len(points), np.bool_)
+        unknown = np.flatnonzero((depth > self._config.min_depth) & (depth <= self._config.max_depth))
+        for earlier in reversed(self._views):
+            if not unknown.size:
+                break
+            of_unknown = torch.from_numpy(points[unknown])
+            is_free = is_free_space(of_unknown, earlier, self._camera, self._config).numpy()
+            found[unknown[is_free == 0]] = True
+            unknown = unknown[np.isnan(is_free)]
+        static = torch.zeros_like(pixels)
+        static.numpy()[rows, columns] = found
+        return static
+
+    def add_view(self, view: DepthView, T_cw: Tensor, static: Tensor) -> None:
+        """Store the static part of a view if the last one is old enough, and drop views that are too old.
+
+        Args:
+            view: View, newer than all stored ones.
+            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            static: Pixels of the static scene without people, bool, shape :math:`(H, W)`.
+        """
+        is_early = bool(self._views) and view.stamp < self._views[-1].stamp + _INTERVAL - STAMP_TOLERANCE
+        if is_early or not self._config.enabled:
+            return
+        new = StoredView(view.stamp, view.nearest_depth * static, T_cw)
+        self._views = [each for each in self._views if each.stamp >= view.stamp - _TIME_SPAN] + [new]
+
+    def drop_views(self) -> None:
+        """Remove the stored views, because the pose relative to them is not known."""
+        self._views = []
+
+    def apply_world_correction(self, T_new_old: Tensor) -> None:
+        """Transform the stored views into the corrected world.
+
+        Args:
+            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
+        """
+        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the stored views."""
+        return {"views": list(self._views)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Replace the stored views.
+
+        Args:
+            state: Result of `state_dict`.
+        """
+        self._views = list(state["views"])
