@@ -44,12 +44,14 @@ def refine(
     beside: int = 0,
     static: Tensor | None = None,
     label: int = PERSON,
+    surface_only: bool = False,
     **mask: float,
 ) -> Tensor:
     """Return the refined mask of the body.
 
     The mask of the network has the upper part only, and some columns ``beside`` it, whose depth is not in the cloud;
     the cloud can have more rows. The pixels ``static`` were a part of the static scene in an earlier view.
+    With ``surface_only``, the second bodies in the mask are left out.
     """
     segmented = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     segmented[ROWS.start : CUT, COLUMNS] = True
@@ -69,9 +71,9 @@ def refine(
         surfaces.add_view(view, view.T_cw, static)
     config = ObjectsConfig(clouds=CloudConfig(voxel_size=SPACING), static_mask=StaticMaskConfig(**mask))
     refiner = MaskRefiner([track], view, NewlyOccupied(appeared, STEP), surfaces, config, CAMERA)
-    crop, refined = refiner.refine(track)
+    refined = refiner.refine(track)
     image = torch.zeros_like(segmented)
-    image[crop] = torch.from_numpy(refined)
+    image[refined.crop] = torch.from_numpy(refined.surface if surface_only else refined.mask)
     return image
 
 
@@ -190,6 +192,7 @@ def test_second_body_in_the_mask_is_kept_unless_its_surface_was_there_before() -
     refined = refine(depth_of(behind), beside=width, surface_margin=0)
     second = slice(ROWS.start, CUT), slice(COLUMNS.stop, COLUMNS.stop + width)
     assert refined[second].double().mean() > 0.9
+    assert not refine(depth_of(behind), beside=width, surface_margin=0, surface_only=True)[second].any()
     appeared = torch.zeros(1, CAMERA.height // STEP, CAMERA.width // STEP, dtype=torch.float64)
     assert refine(depth_of(behind), appeared, beside=width, surface_margin=0)[second].double().mean() < 0.1
     appeared[:] = 1.0

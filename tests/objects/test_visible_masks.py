@@ -34,10 +34,10 @@ def track_of(mask: Tensor, label: int = PERSON, *, missed: bool = False) -> Trac
     return track
 
 
-def refined(mask: Tensor) -> RefinedMask:
-    """Return a mask as a refined mask of rows 4 to 56 and columns 8 to 72."""
+def refined(surface: Tensor, mask: Tensor | None = None) -> RefinedMask:
+    """Return a refined mask of rows 4 to 56 and columns 8 to 72; the mask is the surface unless it is given."""
     crop = slice(4, 56), slice(8, 72)
-    return RefinedMask(crop, mask.numpy()[crop])
+    return RefinedMask(crop, surface.numpy()[crop], (surface if mask is None else mask).numpy()[crop])
 
 
 def test_object_without_a_refined_mask_has_the_mask_of_the_network() -> None:
@@ -71,6 +71,15 @@ def test_pixels_that_the_network_gives_to_both_objects_stay_visible() -> None:
     own, other = box((10, 50), (20, 40)), box((10, 50), (30, 60))
     track = track_of(own)
     assert torch.equal(visible_masks([track, track_of(other)], {track: refined(own)}, ALL_MEASURED)[0], own)
+
+
+def test_second_object_in_the_mask_of_a_detected_one_is_visible_as_itself() -> None:
+    """The network draws one mask over two people; depth shows which pixels belong to which one."""
+    both, near, far = box((10, 50), (20, 60)), box((10, 50), (20, 42)), box((10, 50), (40, 60))
+    detected, missed = track_of(both), track_of(far, missed=True)
+    first, second = visible_masks([detected, missed], {detected: refined(near, both)}, ALL_MEASURED)
+    assert torch.equal(first, near)
+    assert torch.equal(second, far & ~near)
 
 
 @pytest.mark.parametrize(("end", "is_visible"), [(30, True), (29, False)])

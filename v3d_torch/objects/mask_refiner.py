@@ -45,10 +45,13 @@ class RefinedMask(NamedTuple):
 
     Attributes:
         crop: Rows and columns of the part; none if the mask is empty.
-        mask: Pixels of the object there, bool, shape :math:`(h, w)`.
+        surface: Pixels of the object there, bool, shape :math:`(h, w)`.
+        mask: These, and the pixels in the network's mask of others that were not there before, bool, shape
+            :math:`(h, w)`.
     """
 
     crop: Crop
+    surface: NDArray[np.bool_]
     mask: NDArray[np.bool_]
 
 
@@ -126,11 +129,15 @@ class MaskRefiner:
         """Return the refined mask of one of the objects."""
         crop = crop_around(track.mask.view(torch.uint8).numpy(), self._reach, self._step)
         if crop is None:
-            return RefinedMask((slice(0, 0), slice(0, 0)), np.zeros((0, 0), np.bool_))
-        return RefinedMask(crop, self._refine(track, crop))
+            nothing = np.zeros((0, 0), np.bool_)
+            return RefinedMask((slice(0, 0), slice(0, 0)), nothing, nothing)
+        surface = self._surface(track, crop)
+        if track.missed or track not in self._silhouettes:
+            return RefinedMask(crop, surface, surface)
+        return RefinedMask(crop, surface, self._with_new_parts(surface, track.mask.numpy()[crop], crop))
 
-    def _refine(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
-        """Return the refined mask in a part of the image that contains all of it, shape (h, w)."""
+    def _surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
+        """Return the pixels of an object in a part of the image that contains all of them, shape (h, w)."""
         config, segmented, cloud_pixels = self._config, track.mask.numpy()[crop], track.cloud_pixels[crop]
         if track not in self._silhouettes:  # too few points for a depth range of the object
             # A predicted mask already agrees with the depth; without points it is the last one.
@@ -140,8 +147,8 @@ class MaskRefiner:
         tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
         depth, origin = self._view.depth[:, *crop].contiguous(), (crop[0].start, crop[1].start)
         reachable = silhouette.mask(depth, config.surface_margin, tolerance, origin=origin)
-        # A thing that moves now was a static surface before, but views are stored without people.
         cells = self._cells(crop)
+        # A thing that moves now was a static surface before, but views are stored without people.
         static = self._static_surface[cells] & (track.label == PERSON)
         mask = self._grow_surface(segmented, cloud_pixels, reachable, static, cells)
         if track.missed:  # a predicted mask already agrees with the depth
@@ -153,22 +160,24 @@ class MaskRefiner:
         agreeing &= segmented | ~upsample_nearest(static, self._stride, mask.shape).numpy()
         mask |= agreeing
         mask |= cloud_pixels.numpy()
-        self._add_new_parts(mask, segmented, crop)
         return mask
 
-    def _add_new_parts(self, mask: NDArray[np.bool_], segmented: NDArray[np.bool_], crop: Crop) -> None:
-        """Add the parts of the network's mask whose surface was not there before to the refined mask, in place.
+    def _with_new_parts(
+        self, surface: NDArray[np.bool_], segmented: NDArray[np.bool_], crop: Crop
+    ) -> NDArray[np.bool_]:
+        """Return an object's pixels and the parts of the network's mask whose surface was not there before, (h, w).
 
         A network sometimes draws one mask over two people; the second one is not known background.
         """
         stride = self._stride
-        cells = segmented[::stride, ::stride] & ~mask[::stride, ::stride] & self._new_surface[self._cells(crop)]
+        cells = segmented[::stride, ::stride] & ~surface[::stride, ::stride] & self._new_surface[self._cells(crop)]
         # Contours are coarse: narrow parts along them are background that was not observed before.
         kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
         parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
-        if parts.any():
-            pixels = upsample_nearest(parts, stride, mask.shape).numpy()
-            mask |= pixels & segmented & ~self._view.missing.numpy()[crop]
+        if not parts.any():
+            return surface
+        pixels = upsample_nearest(parts, stride, surface.shape).numpy()
+        return surface | (pixels & segmented & ~self._view.missing.numpy()[crop])
 
     def _grow_surface(
         self,

@@ -47,7 +47,7 @@ def _outside(masks: Sequence[RefinedMask], size: torch.Size, dilation: int) -> T
     if not masks:
         return torch.ones(size, dtype=torch.bool)
     covered = np.zeros(size, np.bool_)
-    for crop, mask in masks:
-        covered[crop] |= mask
+    for each in masks:
+        covered[each.crop] |= each.mask
     outside = dilate(torch.from_numpy(covered), dilation).numpy()
     return torch.from_numpy(np.logical_not(outside, out=outside))
