@@ -80,6 +80,8 @@ def test_second_object_in_the_mask_of_a_detected_one_is_visible_as_itself() -> N
     first, second = visible_masks([detected, missed], {detected: refined(near, both)}, ALL_MEASURED)
     assert torch.equal(first, near)
     assert torch.equal(second, far & ~near)
+    # Without it, a part at another depth can be an arm.
+    assert torch.equal(visible_masks([detected], {detected: refined(near, both)}, ALL_MEASURED)[0], both)
 
 
 @pytest.mark.parametrize(("end", "is_visible"), [(30, True), (29, False)])

@@ -19,9 +19,10 @@ _MIN_OWN_FRACTION = 0.5
 def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask], missing: Tensor) -> list[Tensor]:
     """Return the visible pixels of each object, bool, shape :math:`(H, W)`.
 
-    They are the surface of the refined mask, if there is one, without the pixels that its margin adds where depth is
-    missing or where the network detected another object of the class. A predicted mask lacks the visible pixels of
-    detected objects of its class. It is empty if these are most of it: the object is behind another one.
+    They are those of the refined mask, if there is one, without the pixels that its margin adds where depth is missing
+    or where the network detected another object of the class. A predicted mask lacks the surfaces of detected objects
+    of its class. It is empty if these are most of it: the object is behind another one. Otherwise the detected objects
+    lack its pixels: the network sometimes draws one mask over two.
 
     Args:
         tracks: Tracks of the frame, detected or missed.
@@ -29,16 +30,20 @@ def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask],
         missing: Pixels without depth, bool, shape :math:`(H, W)`.
     """
     detected = [track for track in tracks if not track.missed]
+    predicted = [track for track in tracks if track.missed and track.visible]
     segmented = _unions(detected, [track.mask.numpy() for track in detected])
-    masks = {
-        track: _correct(track.mask.numpy(), refined[track], segmented.get(track.label), missing.numpy())
-        if track in refined
-        else track.mask.numpy()
-        for track in tracks
-    }
-    shown = _unions(detected, [masks[track] for track in detected])
-    missed = {track: _visible_part(track, masks[track], shown.get(track.label)) for track in tracks if track.missed}
-    return [torch.from_numpy(missed.get(track, masks[track])) for track in tracks]
+    masks = {track: np.zeros(missing.shape, np.bool_) for track in tracks}
+    for track in (*detected, *predicted):
+        masks[track] = _corrected(track, refined.get(track), segmented.get(track.label), missing.numpy())
+    if predicted:
+        surfaces = _unions(detected, [_surface(track, refined.get(track)) for track in detected])
+        for track in predicted:
+            masks[track] = _visible_part(track, masks[track], surfaces.get(track.label))
+        behind = _unions(predicted, [masks[track] for track in predicted])
+        for track in detected:
+            if track.label in behind:
+                masks[track] = masks[track] & ~behind[track.label]
+    return [torch.from_numpy(masks[track]) for track in tracks]
 
 
 def _unions(tracks: Sequence[Track], masks: Sequence[NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:
@@ -52,23 +57,34 @@ def _unions(tracks: Sequence[Track], masks: Sequence[NDArray[np.bool_]]) -> dict
     return unions
 
 
-def _correct(
-    own: NDArray[np.bool_],
-    refined: RefinedMask,
-    segmented: NDArray[np.bool_] | None,
-    missing: NDArray[np.bool_],
+def _corrected(
+    track: Track, refined: RefinedMask | None, segmented: NDArray[np.bool_] | None, missing: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Return the surface of a refined mask without margins over missing depth and other objects, shape (H, W)."""
+    """Return the refined mask of an object without margins over missing depth and other objects, shape (H, W)."""
+    own: NDArray[np.bool_] = track.mask.numpy()
+    if refined is None:
+        return own
     crop, mask = refined.crop, np.zeros_like(own)
     unclear = missing[crop].copy() if segmented is None else missing[crop] | segmented[crop]
     np.greater(unclear, own[crop], out=unclear)  # a & ~b without a copy of b
-    np.greater(refined.surface, unclear, out=mask[crop])
+    np.greater(refined.mask, unclear, out=mask[crop])
     return mask
 
 
-def _visible_part(track: Track, mask: NDArray[np.bool_], shown: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
-    """Return the visible pixels of a missed object, shape (H, W)."""
-    hidden = np.zeros_like(mask) if shown is None else shown
+def _surface(track: Track, refined: RefinedMask | None) -> NDArray[np.bool_]:
+    """Return the pixels of an object without those of others in its mask, shape (H, W)."""
+    own: NDArray[np.bool_] = track.mask.numpy()
+    if refined is None:
+        return own
+    surface = np.zeros_like(own)
+    surface[refined.crop] = refined.surface
+    return surface
+
+
+def _visible_part(track: Track, mask: NDArray[np.bool_], surfaces: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """Return the pixels of a predicted mask that show none of the surfaces of detected objects, shape (H, W)."""
+    if surfaces is None:
+        return mask
     predicted = track.mask.numpy()
-    is_visible = track.visible and (predicted & ~hidden).sum() > _MIN_OWN_FRACTION * predicted.sum()
-    return mask & ~hidden if is_visible else np.zeros_like(mask)
+    is_visible = (predicted & ~surfaces).sum() > _MIN_OWN_FRACTION * predicted.sum()
+    return mask & ~surfaces if is_visible else np.zeros_like(mask)
