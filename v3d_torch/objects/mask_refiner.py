@@ -157,7 +157,9 @@ class MaskRefiner:
         agreeing = silhouette.mask(depth, config.depth_margin, tolerance, origin=origin).numpy()
         agreeing |= self._view.missing.numpy()[crop]
         agreeing &= _dilate(segmented, config.depth_margin)
-        agreeing &= segmented | ~upsample_nearest(static, self._stride, mask.shape).numpy()
+        if static.any():
+            excluded = upsample_nearest(static, self._stride, mask.shape).numpy() > segmented
+            np.greater(agreeing, excluded, out=agreeing)  # a & ~b without a copy of b
         mask |= agreeing
         mask |= cloud_pixels.numpy()
         return mask

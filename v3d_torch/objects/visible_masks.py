@@ -29,10 +29,12 @@ def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask],
         refined: Refined masks of some of them.
         missing: Pixels without depth, bool, shape :math:`(H, W)`.
     """
-    detected = [track for track in tracks if not track.missed]
     predicted = [track for track in tracks if track.missed and track.visible]
+    # Only masks of these classes are changed.
+    labels = {track.label for track in (*refined, *predicted)}
+    detected = [track for track in tracks if not track.missed and track.label in labels]
     segmented = _unions(detected, [track.mask.numpy() for track in detected])
-    masks = {track: np.zeros(missing.shape, np.bool_) for track in tracks}
+    masks = {track: track.mask.numpy() for track in tracks if not track.missed}
     for track in (*detected, *predicted):
         masks[track] = _corrected(track, refined.get(track), segmented.get(track.label), missing.numpy())
     if predicted:
@@ -43,7 +45,7 @@ def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask],
         for track in detected:
             if track.label in behind:
                 masks[track] = masks[track] & ~behind[track.label]
-    return [torch.from_numpy(masks[track]) for track in tracks]
+    return [torch.from_numpy(masks[track]) if track in masks else torch.zeros_like(missing) for track in tracks]
 
 
 def _unions(tracks: Sequence[Track], masks: Sequence[NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:
