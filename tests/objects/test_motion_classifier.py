@@ -476,6 +476,27 @@ def test_thing_whose_features_shift_is_dynamic_until_they_have_not_for_a_second(
     assert [frame for frame in range(50) if dynamic[frame]] == list(expected)
 
 
+def test_thing_is_static_although_something_in_its_mask_moves() -> None:
+    """The mask of a table contains an arm before it, on which most of its features are."""
+    depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)
+    depth[:, 30:60, 50:80] = 1.0
+    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mask[:, 30:90, 50:110] = True
+    table = Instances(mask, torch.tensor([60]), torch.tensor([0.9]), torch.zeros(1, 4))
+    pixel = torch.cartesian_prod(torch.arange(2, CAMERA.width, 5), torch.arange(2, CAMERA.height, 5))
+    on_arm = depth[0, pixel[:, 1], pixel[:, 0]] == 1.0
+    on_table = mask[0, pixel[:, 1], pixel[:, 0]] & ~on_arm
+    on_table[::6] = False
+    pixel, on_arm = pixel[~on_table], on_arm[~on_table]
+    residuals = torch.zeros(len(pixel), 2, dtype=torch.float64)
+    residuals[on_arm, 0] = 1.0
+    stage = ObjectStage(load_config(None, ()).objects)
+    for frame in range(15):
+        stage.feature_support = FeatureSupport(pixel, torch.ones(len(pixel), dtype=torch.bool), residuals)
+        (obj,) = stage(frame / 30, table, depth, HERE).objects
+        assert obj.motion_state is MotionState.STATIC
+
+
 @pytest.mark.parametrize("label", [PERSON, DOG])
 @pytest.mark.parametrize(("enabled", "motion_state"), [("true", MotionState.STATIC), ("false", MotionState.UNKNOWN)])
 def test_new_detection_of_old_surface_is_static_at_once(label: int, enabled: str, motion_state: MotionState) -> None:

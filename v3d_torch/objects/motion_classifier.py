@@ -209,7 +209,8 @@ class MotionClassifier:
         config = self._config.feature_shift
         if not config.enabled:
             return set()
-        for track, shift in zip(tracks, feature_support.shifts([each.mask for each in tracks]), strict=True):
+        # A mask can contain other objects: the arms of people who sit at a table are in the mask of the table.
+        for track, shift in zip(tracks, feature_support.shifts([each.cloud_pixels for each in tracks]), strict=True):
             track.add_shift(stamp, shift, config.time_span)
         return {track for track in tracks if track.last_shifted == stamp}
 
