@@ -9,9 +9,7 @@ position, the point has appeared.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -26,6 +24,7 @@ from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.depth_view import DepthView, SpaceView, StoredView
 from v3d_torch.objects.image_scale import coarse_stride
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.stored_views import StoredViews
 from v3d_torch.types import MIN_INTERVAL, STAMP_TOLERANCE
 
 _VIEW_MARGIN = 0.2
@@ -150,7 +149,7 @@ def vacated_fractions(
     return torch.from_numpy(np.where(known >= max(config.min_points, 1), vacated / np.maximum(known, 1), np.nan))
 
 
-class FreeSpaceCheck:
+class FreeSpaceCheck(StoredViews):
     """Comparison of each view with earlier views: pixels that newly occupy free space.
 
     Args:
@@ -159,9 +158,9 @@ class FreeSpaceCheck:
     """
 
     def __init__(self, config: FreeSpaceConfig, camera: PinholeCamera) -> None:
+        super().__init__()
         self._config = config
         self._camera = camera
-        self._views: list[StoredView] = []
         self._stride = coarse_stride(camera)
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
@@ -206,33 +205,8 @@ class FreeSpaceCheck:
             view: View, newer than all stored ones.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         """
-        oldest = view.stamp - max(self._config.time_spans, default=0.0) - _VIEW_MARGIN
-        new = StoredView(view.stamp, view.nearest_depth, T_cw)
-        self._views = [stored for stored in self._views if stored.stamp >= oldest] + [new]
-
-    def drop_views(self) -> None:
-        """Remove the stored views, because the pose relative to them is not known."""
-        self._views = []
-
-    def apply_world_correction(self, T_new_old: Tensor) -> None:
-        """Transform the stored views into the corrected world.
-
-        Args:
-            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
-        """
-        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the stored views."""
-        return {"views": list(self._views)}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the stored views.
-
-        Args:
-            state: Result of `state_dict`.
-        """
-        self._views = list(state["views"])
+        max_age = max(self._config.time_spans, default=0.0) + _VIEW_MARGIN
+        self._store(StoredView(view.stamp, view.nearest_depth, T_cw), max_age)
 
     def _newest_view_before(self, stamp: float) -> StoredView | None:
         return next((view for view in reversed(self._views) if view.stamp <= stamp + STAMP_TOLERANCE), None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ class NewlyOccupied:
     appeared: Tensor
     stride: int
 
-    @property
+    @cached_property
     def is_new(self) -> Tensor:
         """Pixels whose space was free over some time span, bool, shape :math:`(h, w)`."""
         return torch.from_numpy((self.appeared.numpy() == 1).any(axis=0))  # NumPy is faster here than torch

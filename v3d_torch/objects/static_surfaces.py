@@ -6,10 +6,6 @@ feet of a person who walks towards the camera seems as new as the person. Views 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -19,6 +15,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.depth_view import DepthView, StoredView
 from v3d_torch.objects.free_space_check import is_free_space
+from v3d_torch.objects.stored_views import StoredViews
 from v3d_torch.types import STAMP_TOLERANCE
 
 _TIME_SPAN = 3.0
@@ -28,7 +25,7 @@ _INTERVAL = 0.5
 """Time between two views, seconds: a walking person moves by about the width of a person."""
 
 
-class StaticSurfaces:
+class StaticSurfaces(StoredViews):
     """Views of the last seconds that contain the static scene only.
 
     Args:
@@ -37,9 +34,9 @@ class StaticSurfaces:
     """
 
     def __init__(self, config: FreeSpaceConfig, camera: PinholeCamera) -> None:
+        super().__init__()
         self._config = config
         self._camera = camera
-        self._views: list[StoredView] = []
 
     def find(self, view: DepthView, pixels: Tensor, stride: int) -> Tensor:
         """Find the pixels whose surface is a static one of an earlier view.
@@ -84,29 +81,4 @@ class StaticSurfaces:
         is_early = bool(self._views) and view.stamp < self._views[-1].stamp + _INTERVAL - STAMP_TOLERANCE
         if is_early or not self._config.enabled:
             return
-        new = StoredView(view.stamp, view.nearest_depth * static, T_cw)
-        self._views = [each for each in self._views if each.stamp >= view.stamp - _TIME_SPAN] + [new]
-
-    def drop_views(self) -> None:
-        """Remove the stored views, because the pose relative to them is not known."""
-        self._views = []
-
-    def apply_world_correction(self, T_new_old: Tensor) -> None:
-        """Transform the stored views into the corrected world.
-
-        Args:
-            T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
-        """
-        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the stored views."""
-        return {"views": list(self._views)}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the stored views.
-
-        Args:
-            state: Result of `state_dict`.
-        """
-        self._views = list(state["views"])
+        self._store(StoredView(view.stamp, view.nearest_depth * static, T_cw), _TIME_SPAN)
