@@ -251,6 +251,17 @@ def test_predicted_cloud_moves_like_the_predicted_state() -> None:
         torch.testing.assert_close(motion, track.predict_state(stamp).position - start)
 
 
+def test_cloud_of_the_last_detection_moves_with_the_object() -> None:
+    track_boards = BoardTracker()
+    (track,) = track_boards(Board(-0.5))
+    assert track.earlier_cloud() is None
+    for frame in range(1, 20):
+        track_boards(Board(-0.5 + 0.03 * frame))
+    cloud = track.earlier_cloud()
+    assert cloud is not None
+    assert float((cloud.mean(dim=0) - track.newest.cloud.mean(dim=0)).norm()) < 0.01
+
+
 def test_clouds_are_predicted_together_in_the_camera_frame() -> None:
     track_boards = BoardTracker()
     for frame in range(10):

@@ -45,13 +45,15 @@ def refine(
     static: Tensor | None = None,
     label: int = PERSON,
     surface_only: bool = False,
+    before: Tensor | None = None,
     **mask: float,
 ) -> Tensor:
     """Return the refined mask of the body.
 
     The mask of the network has the upper part only, and some columns ``beside`` it, whose depth is not in the cloud;
     the cloud can have more rows. The pixels ``static`` were a part of the static scene in an earlier view.
-    With ``surface_only``, the second bodies in the mask are left out.
+    With ``surface_only``, the other parts of the mask are left out. The pixels ``before`` were in the cloud of the
+    detection before.
     """
     segmented = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
     segmented[ROWS.start : CUT, COLUMNS] = True
@@ -62,6 +64,9 @@ def refine(
     segmented[ROWS.start : CUT, COLUMNS.stop : COLUMNS.stop + beside] = True
     track = Track(1, 0.0, TrackerConfig(), segmented, pixels, pack_masks(segmented), missed=missed)
     track.update_label(label, 0.9)
+    if before is not None:
+        earlier = (CAMERA.rays * depth[0][..., None])[before][::5]
+        track.add_detection(Detection3D(-1 / 30, torch.full((3,), torch.nan, dtype=torch.float64), earlier))
     track.add_detection(Detection3D(0.0, cloud.mean(dim=0).to(torch.float64), cloud))
     if appeared is None:
         appeared = torch.full((1, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
@@ -197,6 +202,21 @@ def test_second_body_in_the_mask_is_kept_unless_its_surface_was_there_before() -
     assert refine(depth_of(behind), appeared, beside=width, surface_margin=0)[second].double().mean() < 0.1
     appeared[:] = 1.0
     assert refine(depth_of(behind), appeared, beside=width, surface_margin=0)[second].double().mean() > 0.9
+
+
+def test_part_of_the_mask_that_belonged_to_the_object_at_its_last_detection_is_kept() -> None:
+    """An arm is the largest cluster now; the body behind it was there before, as the wall was."""
+    width = 40
+    body = ROWS, slice(COLUMNS.stop, COLUMNS.stop + width)
+    appeared = torch.zeros(1, CAMERA.height // STEP, CAMERA.width // STEP, dtype=torch.float64)
+    before = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    before[body] = True
+    part = slice(ROWS.start, CUT), body[1]
+    for z, expected in ((2.4, True), (WALL, False)):
+        depth = depth_of((*body, z))
+        refined = refine(depth, appeared, beside=width, surface_margin=0, before=before if expected else None)
+        assert bool(refined[part].double().mean() > 0.9) is expected
+        assert not refined[CUT + STEP :, COLUMNS.stop + STEP :].any(), "only the network's mask can be kept"
 
 
 def test_narrow_background_along_the_contour_of_a_mask_is_not_kept() -> None:

@@ -65,6 +65,15 @@ def test_wall_that_was_never_visible_and_the_person_are_not_static() -> None:
     assert not body_of(surfaces.find(view(2.0, person=PERSON), EVERYWHERE, STEP)).any()
 
 
+def test_person_who_moved_by_some_pixels_is_not_static() -> None:
+    """The minimum depth around a pixel beside the person is that of the person."""
+    surfaces = surfaces_with((view(1.0, person=PERSON), without_person()))
+    moved = torch.full((1, CAMERA.height, CAMERA.width), WALL)
+    moved[0][:, 68:108][BODY[0]] = PERSON
+    found = surfaces.find(DepthView(2.0, moved, HERE), EVERYWHERE, STEP)
+    assert not found[BODY[0].start // STEP : BODY[0].stop // STEP, 34:54].any()
+
+
 @pytest.mark.parametrize(("newest", "expected"), [(PERSON, True), (WALL, False)])
 def test_newest_view_that_observes_the_place_decides(newest: float, expected: bool) -> None:
     """A thing at the place of the person was there, and has gone or not; or it has come since."""

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.objects.depth_view import DepthView
@@ -36,8 +37,8 @@ _TOLERANCE_GROWTH = 0.01
 """Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
 depth of a structured-light camera."""
 
-_MIN_PART_RADIUS = 8
-"""Minimum radius of a part of a mask that is kept because its surface was not there before, pixels."""
+_MIN_PART_RADIUS = 2
+"""Minimum radius of a part of the network's mask that is kept beside the object's surface, coarse pixels."""
 
 
 class RefinedMask(NamedTuple):
@@ -46,8 +47,8 @@ class RefinedMask(NamedTuple):
     Attributes:
         crop: Rows and columns of the part; none if the mask is empty.
         surface: Pixels of the object there, bool, shape :math:`(h, w)`.
-        mask: These, and the pixels in the network's mask of others that were not there before, bool, shape
-            :math:`(h, w)`.
+        mask: These, and other parts of the network's mask: those that were not there before, and those that belonged to
+            the object at its last detection, bool, shape :math:`(h, w)`.
     """
 
     crop: Crop
@@ -79,6 +80,8 @@ class MaskRefiner:
         self._people = [track for track in tracks if track.label == PERSON]
         self._view = view
         self._config = config.static_mask
+        self._camera = camera
+        self._spacing = config.clouds.voxel_size
         self._newly_occupied = newly_occupied
         self._static_surfaces = static_surfaces
         self._stride = newly_occupied.stride
@@ -88,7 +91,7 @@ class MaskRefiner:
         with_centroid = [track for track in tracks if track.newest.has_centroid]
         clouds = predict_clouds(with_centroid, view.stamp, view.T_cw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
-        projected = silhouettes(clouds, camera, config.clouds.voxel_size)
+        projected = silhouettes(clouds, camera, self._spacing)
         self._silhouettes = dict(zip(with_centroid, zip(projected, median_depths, strict=True), strict=True))
 
     @cached_property
@@ -134,7 +137,7 @@ class MaskRefiner:
         surface = self._surface(track, crop)
         if track.missed or track not in self._silhouettes:
             return RefinedMask(crop, surface, surface)
-        return RefinedMask(crop, surface, self._with_new_parts(surface, track.mask.numpy()[crop], crop))
+        return RefinedMask(crop, surface, self._with_other_parts(track, surface, crop))
 
     def _surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
         """Return the pixels of an object in a part of the image that contains all of them, shape (h, w)."""
@@ -143,8 +146,7 @@ class MaskRefiner:
             # A predicted mask already agrees with the depth; without points it is the last one.
             is_predicted = track.missed and len(track.newest.cloud) > 0
             return segmented if is_predicted else _dilate(segmented, config.depth_margin)
-        silhouette, median_depth = self._silhouettes[track]
-        tolerance = config.depth_tolerance + _TOLERANCE_GROWTH * median_depth**2
+        silhouette, tolerance = self._silhouettes[track][0], self._tolerance(track)
         depth, origin = self._view.depth[:, *crop].contiguous(), (crop[0].start, crop[1].start)
         reachable = silhouette.mask(depth, config.surface_margin, tolerance, origin=origin)
         cells = self._cells(crop)
@@ -164,22 +166,36 @@ class MaskRefiner:
         mask |= cloud_pixels.numpy()
         return mask
 
-    def _with_new_parts(
-        self, surface: NDArray[np.bool_], segmented: NDArray[np.bool_], crop: Crop
-    ) -> NDArray[np.bool_]:
-        """Return an object's pixels and the parts of the network's mask whose surface was not there before, (h, w).
+    def _tolerance(self, track: Track) -> float:
+        """Return the maximum depth difference between a pixel and the points of an object around it, metres."""
+        return self._config.depth_tolerance + _TOLERANCE_GROWTH * self._silhouettes[track][1] ** 2
 
-        A network sometimes draws one mask over two people; the second one is not known background.
+    def _with_other_parts(self, track: Track, surface: NDArray[np.bool_], crop: Crop) -> NDArray[np.bool_]:
+        """Return an object's pixels and other parts of the network's mask, bool, shape (h, w).
+
+        A network sometimes draws one mask over two people; the second one is not known background. The points of the
+        object are the largest cluster, which lacks the body if an arm is far in front of it: what belonged to the
+        object at its last detection is not lost.
         """
-        stride = self._stride
-        cells = segmented[::stride, ::stride] & ~surface[::stride, ::stride] & self._new_surface[self._cells(crop)]
+        stride, segmented = self._stride, track.mask.numpy()[crop]
+        cells = segmented[::stride, ::stride] & ~surface[::stride, ::stride]
+        cells &= self._new_surface[self._cells(crop)] | self._earlier_surface(track, crop)
         # Contours are coarse: narrow parts along them are background that was not observed before.
-        kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
-        parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
+        parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, ellipse(_MIN_PART_RADIUS)).view(np.bool_)
         if not parts.any():
             return surface
         pixels = upsample_nearest(parts, stride, surface.shape).numpy()
         return surface | (pixels & segmented & ~self._view.missing.numpy()[crop])
+
+    def _earlier_surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
+        """Return every n-th pixel of a part of the image that shows the points of the last detection of an object."""
+        depth = self._view.depth[:, *crop][:, :: self._stride, :: self._stride]
+        cloud = track.earlier_cloud()
+        if cloud is None:
+            return np.zeros(depth.shape[1:], np.bool_)
+        silhouette = silhouettes([transform_points(self._view.T_cw, cloud)], self._camera, self._spacing)[0]
+        origin = crop[0].start, crop[1].start
+        return silhouette.mask(depth, 0, self._tolerance(track), stride=self._stride, origin=origin).numpy()
 
     def _grow_surface(
         self,

@@ -6,6 +6,8 @@ feet of a person who walks towards the camera seems as new as the person. Views 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -81,4 +83,6 @@ class StaticSurfaces(StoredViews):
         is_early = bool(self._views) and view.stamp < self._views[-1].stamp + _INTERVAL - STAMP_TOLERANCE
         if is_early or not self._config.enabled:
             return
-        self._store(StoredView(view.stamp, view.nearest_depth * static, T_cw), _TIME_SPAN)
+        # Without the people's depth first: the minimum around a pixel beside a person would be the person's.
+        nearest_depth = replace(view, depth=view.depth * static).nearest_depth
+        self._store(StoredView(view.stamp, nearest_depth, T_cw), _TIME_SPAN)

@@ -231,6 +231,17 @@ class Track:
         """
         return self._predict_stop(self._filter.state, stamp)
 
+    def earlier_cloud(self) -> Tensor | None:
+        """Predict the cloud of the detection before the newest at the time of the newest, with the current velocity.
+
+        Returns:
+            Point cloud, world frame, metres, float64, shape :math:`(P, 3)`; None if there is no earlier detection.
+        """
+        if len(self.detections) < 2:
+            return None
+        earlier = self.detections[-2]
+        return earlier.cloud.to(torch.float64) + self.velocity * (self.newest.stamp - earlier.stamp)
+
     def centroid_sigma(self, detection: Detection3D) -> float:
         """Return the standard deviation of the centroid of a detection from that of the whole object, metres.
 
