@@ -422,8 +422,9 @@ class V3DSLAM(FramePreprocessor):
         if is_elsewhere:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
             self.classify_motion.static_surfaces.drop_views()
-        if pose.status is not TrackingStatus.LOST and T_new_old is None:
-            self.classify_motion.tracker.register(invert(pose.T_cw) @ predicted_T_cw, all_tracks=is_elsewhere)
+        if pose.status is not TrackingStatus.LOST:
+            guessed_T_cw = predicted_T_cw if T_new_old is None else predicted_T_cw @ invert(T_new_old)
+            self.classify_motion.tracker.register(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_elsewhere)
         self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)

@@ -360,7 +360,7 @@ def test_view_is_not_compared_with_itself() -> None:
 def test_disabled_check_compares_nothing() -> None:
     newly_occupied = check_with(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
     assert newly_occupied.appeared.shape == (0, 30, 40)
-    assert newly_occupied.fractions([torch.ones(120, 160, dtype=torch.bool)], 1, [False]).shape == (1, 0)
+    assert newly_occupied.fractions([torch.ones(120, 160, dtype=torch.bool)], [1], [False]).shape == (1, 0)
 
 
 def test_view_with_guessed_pose_is_not_compared() -> None:
@@ -462,7 +462,7 @@ def test_fraction_of_an_object_is_that_of_its_known_or_of_all_its_pixels(
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
     of_all = [bool(rng.random() < 0.5) for _ in masks]
     fractions = NewlyOccupied(torch.from_numpy(appeared), stride).fractions(
-        [torch.from_numpy(mask) for mask in masks], min_pixels, of_all
+        [torch.from_numpy(mask) for mask in masks], 3 * [min_pixels], of_all
     )
     assert fractions.dtype == torch.float64 and fractions.shape == (3, rows)
     for row, mask, whole in zip(fractions, masks, of_all, strict=True):
@@ -481,9 +481,9 @@ def test_fraction_of_half_a_box_is_one_half() -> None:
     newly_occupied = check_with(view(at=0.0))(view(WITH_BOX, at=0.3))
     mask = torch.zeros(120, 160, dtype=torch.bool)
     mask[40:80, 60:140] = True
-    (fractions,) = newly_occupied.fractions([mask], CONFIG.min_points, [False])
+    (fractions,) = newly_occupied.fractions([mask], [CONFIG.min_points], [False])
     assert fractions[0] == 0.5 and fractions[1].isnan()
-    assert newly_occupied.fractions([mask], 201, [False])[0, 0].isnan()
+    assert newly_occupied.fractions([mask], [201], [False])[0, 0].isnan()
 
 
 # ---------------------------------------------------------------- state

@@ -16,6 +16,7 @@ from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.track import Track, predict_clouds
+from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
 
@@ -95,6 +96,29 @@ def test_second_detection_of_an_object_starts_no_track(visible: slice) -> None:
     for frame in range(6):
         tracks = track_boards.track(depth, both if frame % 2 else part, frame / 30)
         assert [track.id for track in tracks] == [1]
+
+
+def test_part_and_whole_that_appear_in_the_same_frame_are_one_object() -> None:
+    """The part has the higher score, so that the suppression of duplicates keeps both."""
+    track_boards = BoardTracker()
+    depth, whole = render([Board(0.0, height=1.2)])
+    part = replace(whole, masks=torch.zeros_like(whole.masks))
+    part.masks[:, :60] = whole.masks[:, :60]
+    for frame in range(3):
+        tracks = track_boards.track(depth, part.concatenate(whole), frame / 30)
+        assert [track.id for track in tracks] == [1]
+
+
+@pytest.mark.parametrize("label", [PERSON, UNLABELLED])
+def test_hidden_object_gets_its_id_back_with_or_without_a_class(label: int) -> None:
+    track_boards, board = BoardTracker(), Board(0.0, label=label)
+    curtain = Board(0.0, z=1.5, width=2.0, height=2.0, detected=False)
+    for frame in range(40):
+        depth, instances = render([board if not 8 <= frame < 36 else curtain])
+        tracks = track_boards.track(depth, instances, frame / 30)
+        for track in tracks:
+            track.mark_dynamic(frame / 30)
+    assert [track.id for track in tracks] == [1]
 
 
 @pytest.mark.parametrize("compared", [True, False])
@@ -637,14 +661,17 @@ def test_detections_are_bounded_by_the_history() -> None:
 
 
 @pytest.mark.parametrize("all_tracks", [False, True])
-def test_end_of_a_guess_moves_what_was_seen_since_or_all(all_tracks: bool) -> None:
+@pytest.mark.parametrize("guesses", [(5,), (5, 6, 7)], ids=["one frame", "all frames"])
+def test_end_of_a_guess_moves_what_was_seen_since_or_all(guesses: tuple[int, ...], all_tracks: bool) -> None:
+    """The motion of the camera was not measured before one frame, or before several in a row."""
     track_boards, offset = BoardTracker(), HERE.clone()
     offset[0, 3] = 0.3
     for frame in range(8):
-        if frame == 5:
+        if frame in guesses:
             track_boards.tracker.start_unregistered(frame / 30)
         depth, instances = render([Board(0.0)], HERE)
         (track,) = track_boards.track(depth, instances, frame / 30, T_wc=offset if frame >= 5 else HERE)
+    assert track_boards.tracker.comparable_since == guesses[-1] / 30
     track_boards.tracker.register(invert(offset), all_tracks=all_tracks)
     places = [round(float(detection.centroid[0]), 2) for detection in track.detections]
     assert places == (5 * [-0.3] + 3 * [0.0] if all_tracks else 8 * [0.0])

@@ -201,10 +201,14 @@ class FreeSpaceCheck(StoredViews):
     def add_view(self, view: DepthView, T_cw: Tensor) -> None:
         """Store a view with its final pose, and drop the views that are too old for all time spans.
 
+        Nothing is stored if the check is turned off.
+
         Args:
             view: View, newer than all stored ones.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
         """
+        if not self._config.enabled:
+            return
         max_age = max(self._config.time_spans, default=0.0) + _VIEW_MARGIN
         self._store(StoredView(view.stamp, view.nearest_depth, T_cw), max_age)
 

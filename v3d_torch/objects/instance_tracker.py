@@ -86,7 +86,7 @@ class InstanceTracker(torch.nn.Module):
         self.resting: list[Track] = []
         self.lost: list[Track] = []
         self.comparable_since = -torch.inf
-        self._is_unregistered = False  # True if the world frame of the detections since then is not that of the map
+        self._unregistered_since: float | None = None  # the world frame of the detections since then is a guess
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the tracks and the next id, for ``state_dict()``."""
@@ -97,7 +97,7 @@ class InstanceTracker(torch.nn.Module):
             "next_id": self._next_id,
             "last_stamp": self._last_stamp,
             "comparable_since": self.comparable_since,
-            "is_unregistered": self._is_unregistered,
+            "unregistered_since": self._unregistered_since,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -109,7 +109,7 @@ class InstanceTracker(torch.nn.Module):
         self.tracks, self.resting = list(state["tracks"]), list(state["resting"])
         self.lost = list(state["lost"])
         self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
-        self.comparable_since, self._is_unregistered = state["comparable_since"], state["is_unregistered"]
+        self.comparable_since, self._unregistered_since = state["comparable_since"], state["unregistered_since"]
 
     def forward(
         self,
@@ -148,7 +148,7 @@ class InstanceTracker(torch.nn.Module):
             if track is None and self._is_duplicate(i, matches, detected):
                 continue
             masks = instances.masks[i], clouds.cloud_pixels[i], detected.masks[i]
-            track = track or self._start_track(stamp, masks)
+            track = matches[i] = track or self._start_track(stamp, masks)
             track.add_detection(detection)
             track.set_masks(*masks, missed=False)
             track.update_label(int(instances.labels[i]), float(instances.scores[i]))
@@ -179,10 +179,12 @@ class InstanceTracker(torch.nn.Module):
         Args:
             stamp: Timestamp of the frame, seconds.
         """
-        self.comparable_since, self._is_unregistered = stamp, True
+        self.comparable_since = stamp
+        if self._unregistered_since is None:
+            self._unregistered_since = stamp
 
     def register(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
-        """Transform the detections since `start_unregistered` into the world frame of the map.
+        """Transform the detections since the first `start_unregistered` into the world frame of the map.
 
         Args:
             T_new_old: Transform from the world frame of these detections to that of the map, float64, shape
@@ -191,10 +193,10 @@ class InstanceTracker(torch.nn.Module):
         """
         if all_tracks:
             self.apply_world_correction(T_new_old)
-        elif self._is_unregistered:
+        elif self._unregistered_since is not None:
             for track in (*self.tracks, *self.resting, *self.lost):
-                track.apply_world_correction(T_new_old, self.comparable_since)
-        self._is_unregistered = False
+                track.apply_world_correction(T_new_old, self._unregistered_since)
+        self._unregistered_since = None
 
     def _continued_tracks(self, instances: Instances) -> dict[int, Track]:
         """Return the track of each instance of which it is known, by its index."""
@@ -232,13 +234,17 @@ class InstanceTracker(torch.nn.Module):
                 matches[j] = tracks[i]
                 free_tracks[i], free_instances[j] = False, False
 
+        def assign_without_masks(columns: Tensor) -> None:
+            for track, j in self._match_without_masks(detected, columns & free_instances):
+                matches[j] = track
+                free_instances[j] = False
+
         assign(confirmed, labelled)
-        for track, j in self._match_without_masks(detected, labelled & free_instances):
-            matches[j] = track
-            free_instances[j] = False
+        assign_without_masks(labelled)
         assign(~confirmed, labelled)
         assign(~named, ~labelled)
         assign(named, ~labelled)
+        assign_without_masks(~labelled)
         return matches
 
     def _match_without_masks(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:
@@ -256,7 +262,6 @@ class InstanceTracker(torch.nn.Module):
                 self.lost.remove(track)
             else:
                 self.resting.remove(track)
-            self.tracks.append(track)
         return found
 
     def _is_duplicate(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
@@ -273,10 +278,9 @@ class InstanceTracker(torch.nn.Module):
         )
 
     def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor]) -> Track:
-        """Add a track with the next id and return it."""
+        """Return a new track with the next id."""
         track = Track(self._next_id, stamp, self._config, *masks)
         self._next_id += 1
-        self.tracks.append(track)
         return track
 
     def _predict_missed_tracks(

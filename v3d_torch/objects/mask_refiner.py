@@ -37,8 +37,8 @@ _TOLERANCE_GROWTH = 0.01
 """Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
 depth of a structured-light camera."""
 
-_MIN_PART_RADIUS = 2
-"""Minimum radius of a part of the network's mask that is kept beside the object's surface, coarse pixels."""
+_MIN_PART_RADIUS = 8
+"""Minimum radius of a part of the network's mask that is kept beside the object's surface, pixels."""
 
 
 class RefinedMask(NamedTuple):
@@ -181,7 +181,8 @@ class MaskRefiner:
         cells = segmented[::stride, ::stride] & ~surface[::stride, ::stride]
         cells &= self._new_surface[self._cells(crop)] | self._earlier_surface(track, crop)
         # Contours are coarse: narrow parts along them are background that was not observed before.
-        parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, ellipse(_MIN_PART_RADIUS)).view(np.bool_)
+        kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
+        parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
         if not parts.any():
             return surface
         pixels = upsample_nearest(parts, stride, surface.shape).numpy()

@@ -35,12 +35,12 @@ class NewlyOccupied:
         """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
         return torch.from_numpy((self.appeared.numpy() == 0).any(axis=0) & ~self.is_new.numpy())
 
-    def fractions(self, masks: Sequence[Tensor], min_pixels: int, of_all: Sequence[bool]) -> Tensor:
+    def fractions(self, masks: Sequence[Tensor], min_pixels: Sequence[int], of_all: Sequence[bool]) -> Tensor:
         """Return the fraction of each object's pixels that appeared.
 
         Args:
             masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
-            min_pixels: Minimum number of known pixels of an object.
+            min_pixels: Minimum number of known pixels of each object.
             of_all: True for the objects whose fraction is that of all pixels, false for those whose fraction is that of
                 the known pixels; K elements.
 
@@ -55,4 +55,4 @@ class NewlyOccupied:
         counts = count_common_pixels(inside, indicators).to(torch.float64)
         new, known = counts[:, :rows], counts[:, rows:]
         total = torch.where(torch.tensor(of_all)[:, None], count_pixels(inside)[:, None], known)
-        return (new / total).masked_fill(known < min_pixels, torch.nan)
+        return (new / total).masked_fill(known < torch.tensor(min_pixels)[:, None], torch.nan)

@@ -103,7 +103,7 @@ class Track:
         visible: True if the object was detected in the newest frame, or is confirmed, was missed for a short time only,
             and the depth shows it at its predicted position.
         is_confirmed: True if scores or motion have shown that the object exists.
-        detections: Detections of the last second, newest last, at least one.
+        detections: Detections of the last second, newest last; after a longer gap the last two, if there are two.
         labels: Number of detections of each class. Once a detection had a score, those without one do not count.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
         total_score: Sum of the scores of all detections.
@@ -257,7 +257,7 @@ class Track:
             detection: Detection, not older than the newest one.
         """
         oldest = detection.stamp - _DETECTION_TIME - STAMP_TOLERANCE
-        if self.detections and self.newest.stamp < oldest:  # the next detections have no earlier one to compare with
+        if self.detections and self.newest.stamp < oldest:  # it may have moved unobserved, and counts as new
             self.first_stamp = detection.stamp
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))

@@ -45,8 +45,7 @@ def unlabelled_instances(
         Instances of class `UNLABELLED` with score 0 and empty boxes; none if nothing is newly occupied.
     """
     stride, (height, width) = newly_occupied.stride, depth.shape[-2:]
-    appeared = (newly_occupied.appeared == 1).any(dim=0).to(torch.uint8).numpy()
-    appeared = cv2.morphologyEx(appeared, cv2.MORPH_OPEN, _OPENING_KERNEL)
+    appeared = cv2.morphologyEx(newly_occupied.is_new.to(torch.uint8).numpy(), cv2.MORPH_OPEN, _OPENING_KERNEL)
     coarse_masks = subsample(instances.masks, stride)
     explained = _explained_pixels(instances.labels, coarse_masks, torch.from_numpy(appeared > 0))
     appeared[cv2.dilate(explained.to(torch.uint8).numpy(), _RIM_KERNEL) > 0] = 0
