@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import shutil
 import signal
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -20,6 +18,7 @@ from helpers.commands import assert_error_line, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from helpers.forked_command import start_forked
+from helpers.kills import kill_before_renaming, kill_while_tracking
 from helpers.walker_folder import write_walker
 from typer.testing import Result
 
@@ -91,36 +90,42 @@ def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
 # --- killed runs
 
 
-def count_frames(log: Path) -> int:
-    return log.read_text().count(" INFO frame ") if log.is_file() else 0
+KILLS = (
+    (partial(kill_while_tracking, 4), 3),
+    (partial(kill_before_renaming, RunFile.DYNAMICS, 3), 5),
+    (partial(kill_before_renaming, RunFile.CHECKPOINT, 4), 9),
+    (partial(kill_while_tracking, FRAMES - 8), FRAMES - 1),
+    (partial(kill_before_renaming, RunFile.MAP, 1), FRAMES),
+)
+"""Moments at which a run and its resumed runs are killed, and the number of frames in the results then.
+
+They are: while frame 4 is tracked; between the trajectory and ``metrics.json`` of frame 6; between the results of frame
+9 and their checkpoint, so that the next run begins after frame 8; while the last frame is tracked; while the results of
+the whole run are written.
+"""
+
+
+def run_until_killed(kill: Callable[[], None], *arguments: str, cwd: Path) -> None:
+    process = start_forked(*arguments, cwd=cwd, before=kill)
+    process.join(timeout=300)
+    assert process.exitcode == -signal.SIGKILL
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
-def test_run_killed_at_ten_frames_resumes_to_the_same_bytes(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
-    out, rng = tmp_path / "out", random.Random(0)  # noqa: S311
+def test_run_killed_at_five_moments_resumes_to_the_same_bytes(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
     arguments = run_arguments(
         sequence, out, "--save-masks", "--save-map", str(tmp_path / "room.map"), *CHECKPOINT_EVERY_FRAME
     )
-    for frame in sorted(rng.sample(range(1, FRAMES), 10)):
-        process = start_forked(*arguments, cwd=tmp_path)
-        logged, deadline = count_frames(out / "run.log"), time.monotonic() + 60
-        done = json.loads((out / "metrics.json").read_text())["processed"] if (out / "metrics.json").exists() else 0
-        while count_frames(out / "run.log") - logged < frame - done and time.monotonic() < deadline:
-            time.sleep(0.001)
-        time.sleep(0.05 * rng.random())  # kill within a frame, or while results are written
-        process.kill()
-        process.join()
-        assert process.exitcode == -signal.SIGKILL
-        # The results are readable. They can lack the frame that was being written, and one more if the previous kill
-        # came between the results and their checkpoint, because the run then resumed from the frame before.
-        partial = read_run(out)
-        assert partial.trajectory is not None and len(partial.trajectory) == partial.metrics.processed >= frame - 2
-        assert partial.metrics.failure is not None and partial.metrics.failure.startswith("killed or still running")
+    for kill, frames in KILLS:
+        run_until_killed(kill, *arguments, cwd=tmp_path)
+        stored = read_run(out)
+        assert stored.trajectory is not None and len(stored.trajectory) == stored.metrics.processed == frames
+        assert stored.metrics.failure is not None and stored.metrics.failure.startswith("killed or still running")
         assert (out / RunFile.CHECKPOINT).is_file()
         arguments = ["--resume", str(out)]
-    process = start_forked(*arguments, cwd=tmp_path)
-    process.join()
-    assert process.exitcode == 0
+    done = call(*arguments)
+    assert (done.exit_code, done.stderr) == (0, "")
     assert_same_results(out, whole_run)
     for mask in (whole_run / "masks").iterdir():
         assert (out / "masks" / mask.name).read_bytes() == mask.read_bytes()
@@ -134,12 +139,7 @@ def test_killed_run_with_relative_paths_resumes_from_another_folder(
     out = tmp_path / "out"
     shutil.copytree(sequence, tmp_path / "seq", copy_function=os.link)
     arguments = run_arguments(Path("seq"), Path("out"), "--save-masks", *CHECKPOINT_EVERY_FRAME)
-    process, deadline = start_forked(*arguments, cwd=tmp_path), time.monotonic() + 100
-    while count_frames(out / "run.log") < 9 and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.kill()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
+    run_until_killed(partial(kill_while_tracking, 10), *arguments, cwd=tmp_path)
     done = call("--resume", out)
     assert (done.exit_code, done.stderr) == (0, "")
     assert f"of {FRAMES} frames" in done.stdout and f"results: {out}" in done.stdout

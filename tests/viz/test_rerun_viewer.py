@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ import rerun_cli
 import torch
 from helpers.demo_frames import copy_frames
 from helpers.squares import squares
+from helpers.waiting import wait_until
 from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
