@@ -16,9 +16,9 @@ import pytest
 import torch
 from helpers.bags import DEPTH, INFO, RGB, MessageFactory
 from helpers.commands import assert_error_line, invoke
+from helpers.long_wall import CAMERA, Slide
 from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of, save
 from helpers.waiting import wait_until
-from helpers.walls import CAMERA, Slide
 from rich.console import Console
 
 from v3d_torch.cli.record import app

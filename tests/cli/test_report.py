@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers.commands import invoke
-from helpers.squares import squares
-from helpers.wall_run import FRAMES, Wall, square
+from helpers.short_wall import FRAMES, Wall, square
+from helpers.square_segmenter import squares
 from torch import Tensor
 
 from v3d_torch.cli.report import app

@@ -18,7 +18,7 @@ from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from helpers.forked_command import start_forked
 from helpers.kills import kill_before_renaming, kill_while_tracking
-from helpers.walker_folder import write_walker
+from helpers.tum_folder_with_person import write_walker
 from typer.testing import Result
 
 from v3d_torch.batch.job import Job

@@ -16,7 +16,7 @@ import pytest
 from helpers.commands import assert_error_line, assert_same_results, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame
-from helpers.walker_folder import write_walker
+from helpers.tum_folder_with_person import write_walker
 from typer.testing import Result
 
 from v3d_torch.batch import runner

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.rooms import CAMERA
+from helpers.box_room import CAMERA
 from torch import Tensor
 
 from v3d_torch.geometry.camera import back_project

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from helpers.rooms import CAMERA, CRATE, looking_around, render
+from helpers.box_room import CAMERA, CRATE, looking_around, render
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.kernels.voxel_blocks import BITS, HIT, VOLUME
 from v3d_torch.occupancy.occupancy_map import OccupancyMap

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 import torch
+from helpers.short_wall import CAMERA, FRAMES, Wall, square
 from helpers.waiting import wait_until
-from helpers.wall_run import CAMERA, FRAMES, Wall, square
 from torch import Tensor
 
 from v3d_torch.config import Config

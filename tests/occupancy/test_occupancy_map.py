@@ -7,8 +7,8 @@ import logging
 import numpy as np
 import pytest
 import torch
+from helpers.box_room import CAMERA, CRATE, distance_to, looking_around, render
 from helpers.occupancy_scenes import ALL, CONFIG, add_view, box_of_voxels, map_of, map_of_room
-from helpers.rooms import CAMERA, CRATE, distance_to, looking_around, render
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt

@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 
 import pytest
-from helpers.walls import CAMERA
+from helpers.long_wall import CAMERA
 
 from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.types import RGBDFrame

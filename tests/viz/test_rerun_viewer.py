@@ -17,9 +17,9 @@ import pytest
 import rerun_cli
 import torch
 from helpers.demo_frames import copy_frames
-from helpers.squares import squares
+from helpers.short_wall import CAMERA, FRAMES, WALL, Wall
+from helpers.square_segmenter import squares
 from helpers.waiting import wait_until
-from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
