@@ -69,7 +69,7 @@ def test_stub_lists_every_public_name() -> None:
         v3d_torch.nonsense  # noqa: B018
 
 
-COMMANDS = [f"v3d_torch.cli.{path.stem}" for path in ROOT.glob("cli/*.py") if not path.stem.endswith("_command")]
+COMMANDS = [f"v3d_torch.cli.{path.stem}" for path in ROOT.glob("cli/[!_]*.py") if not path.stem.endswith("_command")]
 """Modules that parse options. Those with the suffix ``_command`` are imported after the options are parsed."""
 
 
