@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import sklearn.cluster
 import torch
-from helpers import rooms
+from helpers import box_room
 from helpers.sparse_maps import uniform
 from torch import Tensor
 
@@ -316,9 +316,9 @@ def test_mesh_of_degenerate_depth(shape: str, offset: float) -> None:
     depth[pixels] = 2.0
     T_cw = torch.eye(4, dtype=torch.float64)
     T_cw[:3, 3] = -offset * KILOMETRE
-    views = StaticViews(rooms.CAMERA, 2)
+    views = StaticViews(box_room.CAMERA, 2)
     grey = torch.full((3, 240, 320), 128, dtype=torch.uint8)
-    views.add(rooms.keyframe(T_cw), grey, depth[None], depth > 0)
+    views.add(box_room.keyframe(T_cw), grey, depth[None], depth > 0)
     mesh = fuse_mesh(views, Config().dense_map)
     assert mesh.vertices.isfinite().all() and mesh.normals.isfinite().all()
     assert ((mesh.vertices[:, 2].double() - offset * KILOMETRE[2] - 2.0).abs() < 0.03).all()

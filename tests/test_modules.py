@@ -13,7 +13,9 @@ from itertools import product
 
 import pytest
 import torch
-from helpers.library_settings import torch_threads
+from helpers import camera_inputs
+from helpers.gradients import count_graph_nodes
+from helpers.library_settings import default_dtype, torch_threads
 from helpers.module_cases import (
     CAMERA,
     CAMERA_CASES,
@@ -21,6 +23,7 @@ from helpers.module_cases import (
     FUNCTION_CASES,
     Case,
     Inputs,
+    Make,
     centroids,
     image,
     random,
@@ -140,6 +143,16 @@ def test_module_can_be_copied_and_pickled(case: Case) -> None:
     twin.load_state_dict(case.module.state_dict())
     assert_same(twin(**inputs), expected)
     assert not list(case.module.parameters())  # settings are numbers unless a parameter is given
+
+
+@pytest.mark.parametrize("case", (CASES | FUNCTION_CASES).values(), ids=CASES | FUNCTION_CASES)
+def test_default_dtype_does_not_change_the_result(case: Case) -> None:
+    inputs = case.inputs(2, 12, torch.float32)
+    expected = tensors(case.function(**inputs))
+    with default_dtype(torch.float64):
+        found = tensors(case.function(**inputs))
+    assert [tensor.dtype for tensor in found] == [tensor.dtype for tensor in expected]
+    assert_same(found, expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
@@ -376,6 +389,40 @@ def test_tangent_of_forward_mode_differentiation_equals_jvp(title: str, name: st
         assert other[value.isfinite()].isfinite().all()
         torch.testing.assert_close(torch.zeros_like(other) if one is None else one, other, equal_nan=True)
     assert any(other.any() for other in expected)
+
+
+@pytest.mark.parametrize(
+    ("title", "few", "many", "limit"),
+    [
+        ("PoseRefiner", {"rounds": 1, "iterations": 1}, {"rounds": 8, "iterations": 50}, 200),
+        ("BundleAdjuster", {"iterations": 1}, {"iterations": 30}, 300),
+        ("PoseGraphOptimiser", {"iterations": 1}, {"iterations": 30}, 300),
+    ],
+)
+def test_memory_of_the_gradient_does_not_grow_with_the_iterations(
+    title: str, few: dict[str, int], many: dict[str, int], limit: int
+) -> None:
+    inputs = CASES[title].inputs(1, 24, torch.float64)
+    inputs["weights"].requires_grad_()
+    nodes = [
+        count_graph_nodes(tensors(CASES[title].function(**inputs, **iterations, tolerance=0.0))[0])
+        for iterations in (few, many)
+    ]
+    assert 0 < nodes[0] == nodes[1] < limit
+
+
+@pytest.mark.parametrize(
+    ("function", "make"),
+    [(v3d.refine_pose, camera_inputs.view), (v3d.bundle_adjust, camera_inputs.bundle)],
+    ids=["refine_pose", "bundle_adjust"],
+)
+def test_gradient_mode_does_not_change_the_result(function: Callable[..., object], make: Make) -> None:
+    inputs = make(3, 40, torch.float64)
+    inputs["uv"][:, ::5] += 4.0  # where Huber's kernel is linear
+    plain = function(**inputs)
+    tracked = function(**inputs | {"weights": inputs["weights"].requires_grad_()})
+    for one, other in zip(tensors(tracked), tensors(plain), strict=True):
+        torch.testing.assert_close(one.detach(), other, rtol=1e-9, atol=1e-9)
 
 
 def test_smoothing_has_no_gradient_at_missing_depth() -> None:

@@ -12,9 +12,9 @@ import pytest
 import torch
 from helpers.differences import differences
 from helpers.library_settings import default_dtype
-from helpers.walk_run import CAMERA as WALK_CAMERA
-from helpers.walk_run import CONFIG as WALK_CONFIG
-from helpers.walk_run import Walk, segment_red
+from helpers.walk_with_loop import CAMERA as WALK_CAMERA
+from helpers.walk_with_loop import CONFIG as WALK_CONFIG
+from helpers.walk_with_loop import Walk, segment_red
 from PIL import Image
 from torch import Tensor
 

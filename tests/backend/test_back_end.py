@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.first_frames import FirstFrames
-from helpers.walk_run import make_pipeline
+from helpers.walk_with_loop import make_pipeline
 from torch import Tensor
 
 import v3d_torch.backend.back_end

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from helpers.differences import differences
-from helpers.walk_run import CAMERA, CONFIG, Walk
+from helpers.walk_with_loop import CAMERA, CONFIG, Walk
 
 from v3d_torch.batch.ablation_study import CachedSegmenter
 from v3d_torch.config.loading import override_config

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.walker_folder import write_walker
+from helpers.tum_folder_with_person import write_walker
 
 from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs
 from v3d_torch.config.loading import load_config

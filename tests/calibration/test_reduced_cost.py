@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from helpers.observed_scenes import CAMERA, Scene
+from helpers.bundle_scenes import CAMERA, Scene
 from torch import Tensor
 
 from v3d_torch.calibration.reduced_cost import differentiate_minimum_cost

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -136,11 +134,8 @@ def test_every_ablation_config_is_a_variant_and_all_differ() -> None:
     assert len({load_config(CONFIGS[variant]).model_dump_json() for variant in VARIANTS}) == len(VARIANTS)
 
 
-def test_help_lists_variants_and_does_not_import_torch() -> None:
+def test_help_lists_variants() -> None:
     assert ",".join(VARIANTS) in "".join(call("--help").stdout.split())
-    probe = "import sys, v3d_torch.cli.ablate; print('torch' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
-    assert result.stdout.strip() == "False"
 
 
 # --- errors

@@ -45,14 +45,6 @@ def test_json_from_the_shell(files: tuple[str, str]) -> None:
     assert values["rpe"]["rot"]["max"] < 1e-4 and values["coverage"] is None
 
 
-def test_import_of_command_loads_no_heavy_library() -> None:
-    """Libraries that take seconds to import are imported after the options are parsed."""
-    heavy = {"torch", "scipy", "cv2", "numpy"}
-    probe = f"import sys, v3d_torch.cli.evaluate; print(sorted({heavy} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)  # noqa: S603
-    assert done.stdout.strip() == "[]"
-
-
 def test_tables_have_coverage_units_and_the_papers_methods(files: tuple[str, str]) -> None:
     result = call(*files, "--sequence", "fr3/w/rpy", "--frames", "100")
     assert result.exit_code == 0

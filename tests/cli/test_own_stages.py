@@ -13,7 +13,7 @@ import pytest
 from helpers.commands import assert_error_line, call, call_here
 from helpers.corpus.outputs import at_frame
 from helpers.own_stages import MODULE, SEGMENT, write_own_stages
-from helpers.walker_folder import write_walker
+from helpers.tum_folder_with_person import write_walker
 from PIL import Image
 from typer.testing import CliRunner, Result
 

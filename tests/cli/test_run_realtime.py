@@ -15,9 +15,9 @@ import pytest
 from helpers.commands import assert_error_line, command, invoke
 from helpers.demo_frames import copy_frames
 from helpers.forked_command import start_forked
+from helpers.long_wall import Slide
+from helpers.tum_folder_with_person import write_walker
 from helpers.waiting import wait_until
-from helpers.walker_folder import write_walker
-from helpers.walls import Slide
 from typer.testing import Result
 
 from v3d_torch.cli import run

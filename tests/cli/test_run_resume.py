@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
-import random
 import shutil
 import signal
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -16,11 +13,12 @@ import cv2
 import numpy as np
 import pytest
 from helpers.bag_messages import read_with_mcap
-from helpers.commands import assert_error_line, invoke
+from helpers.commands import REPEATABLE_FILES, assert_error_line, assert_same_results, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame, full_from_frame
 from helpers.forked_command import start_forked
-from helpers.walker_folder import write_walker
+from helpers.kills import kill_before_renaming, kill_while_tracking
+from helpers.tum_folder_with_person import write_walker
 from typer.testing import Result
 
 from v3d_torch.batch.job import Job
@@ -43,8 +41,8 @@ pytestmark = pytest.mark.usefixtures("no_figures")
 
 FRAMES = 20
 CHECKPOINT_EVERY_FRAME = ("--set", "checkpoint.interval=0", "--set", "checkpoint.max_time_fraction=1")
-DEFAULT_RESULTS = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply")
-RESULTS = (*DEFAULT_RESULTS, "mesh.ply", "occupancy.npz", "occupancy.bt")
+ALL_MAPS = (*REPEATABLE_FILES, "mesh.ply", "occupancy.npz", "occupancy.bt")
+assert_same_maps = partial(assert_same_results, files=ALL_MAPS)
 
 
 @pytest.fixture(scope="module")
@@ -72,16 +70,6 @@ def whole_run(sequence: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def assert_same_results(out: Path, expected: Path, files: tuple[str, ...] = RESULTS) -> None:
-    for name in files:
-        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
-    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (out, expected))
-    for key in ("ate", "rpe", "status", "frames", "processed", "keyframes", "landmarks", "loops", "failure"):
-        assert first[key] == second[key], key
-    names = [{path.name for path in folder.iterdir()} - {"figures"} for folder in (out, expected)]
-    assert names[0] == names[1]
-
-
 def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
     """Start a run and press Ctrl-C before a frame is read."""
     with at_frame(frame, lambda: os.kill(os.getpid(), signal.SIGINT)):
@@ -91,37 +79,43 @@ def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
 # --- killed runs
 
 
-def count_frames(log: Path) -> int:
-    return log.read_text().count(" INFO frame ") if log.is_file() else 0
+KILLS = (
+    (partial(kill_while_tracking, 4), 3),
+    (partial(kill_before_renaming, RunFile.DYNAMICS, 3), 5),
+    (partial(kill_before_renaming, RunFile.CHECKPOINT, 4), 9),
+    (partial(kill_while_tracking, FRAMES - 8), FRAMES - 1),
+    (partial(kill_before_renaming, RunFile.MAP, 1), FRAMES),
+)
+"""Moments at which a run and its resumed runs are killed, and the number of frames in the results then.
+
+They are: while frame 4 is tracked; between the trajectory and ``metrics.json`` of frame 6; between the results of frame
+9 and their checkpoint, so that the next run begins after frame 8; while the last frame is tracked; while the results of
+the whole run are written.
+"""
+
+
+def run_until_killed(kill: Callable[[], None], *arguments: str, cwd: Path) -> None:
+    process = start_forked(*arguments, cwd=cwd, before=kill)
+    process.join(timeout=300)
+    assert process.exitcode == -signal.SIGKILL
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGKILL")
-def test_run_killed_at_ten_frames_resumes_to_the_same_bytes(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
-    out, rng = tmp_path / "out", random.Random(0)  # noqa: S311
+def test_run_killed_at_five_moments_resumes_to_the_same_bytes(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
     arguments = run_arguments(
         sequence, out, "--save-masks", "--save-map", str(tmp_path / "room.map"), *CHECKPOINT_EVERY_FRAME
     )
-    for frame in sorted(rng.sample(range(1, FRAMES), 10)):
-        process = start_forked(*arguments, cwd=tmp_path)
-        logged, deadline = count_frames(out / "run.log"), time.monotonic() + 60
-        done = json.loads((out / "metrics.json").read_text())["processed"] if (out / "metrics.json").exists() else 0
-        while count_frames(out / "run.log") - logged < frame - done and time.monotonic() < deadline:
-            time.sleep(0.001)
-        time.sleep(0.05 * rng.random())  # kill within a frame, or while results are written
-        process.kill()
-        process.join()
-        assert process.exitcode == -signal.SIGKILL
-        # The results are readable. They can lack the frame that was being written, and one more if the previous kill
-        # came between the results and their checkpoint, because the run then resumed from the frame before.
-        partial = read_run(out)
-        assert partial.trajectory is not None and len(partial.trajectory) == partial.metrics.processed >= frame - 2
-        assert partial.metrics.failure is not None and partial.metrics.failure.startswith("killed or still running")
+    for kill, frames in KILLS:
+        run_until_killed(kill, *arguments, cwd=tmp_path)
+        stored = read_run(out)
+        assert stored.trajectory is not None and len(stored.trajectory) == stored.metrics.processed == frames
+        assert stored.metrics.failure is not None and stored.metrics.failure.startswith("killed or still running")
         assert (out / RunFile.CHECKPOINT).is_file()
         arguments = ["--resume", str(out)]
-    process = start_forked(*arguments, cwd=tmp_path)
-    process.join()
-    assert process.exitcode == 0
-    assert_same_results(out, whole_run)
+    done = call(*arguments)
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert_same_maps(out, whole_run)
     for mask in (whole_run / "masks").iterdir():
         assert (out / "masks" / mask.name).read_bytes() == mask.read_bytes()
     assert (tmp_path / "room.map").read_bytes() == (whole_run.parent / "room.map").read_bytes()
@@ -134,16 +128,11 @@ def test_killed_run_with_relative_paths_resumes_from_another_folder(
     out = tmp_path / "out"
     shutil.copytree(sequence, tmp_path / "seq", copy_function=os.link)
     arguments = run_arguments(Path("seq"), Path("out"), "--save-masks", *CHECKPOINT_EVERY_FRAME)
-    process, deadline = start_forked(*arguments, cwd=tmp_path), time.monotonic() + 100
-    while count_frames(out / "run.log") < 9 and time.monotonic() < deadline:
-        time.sleep(0.005)
-    process.kill()
-    process.join()
-    assert process.exitcode == -signal.SIGKILL
+    run_until_killed(partial(kill_while_tracking, 10), *arguments, cwd=tmp_path)
     done = call("--resume", out)
     assert (done.exit_code, done.stderr) == (0, "")
     assert f"of {FRAMES} frames" in done.stdout and f"results: {out}" in done.stdout
-    assert_same_results(out, whole_run)
+    assert_same_maps(out, whole_run)
 
 
 # --- interrupted runs, full disks
@@ -158,7 +147,7 @@ def test_interrupted_run_resumes_to_the_same_results(sequence: Path, whole_run: 
     done = call("--resume", tmp_path / "out")
     assert done.exit_code == 0, done.stderr
     assert f"resuming after 11 of {FRAMES} frames" in done.stdout
-    assert_same_results(tmp_path / "out", whole_run)
+    assert_same_maps(tmp_path / "out", whole_run)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no file size limits")
@@ -190,7 +179,7 @@ def test_run_on_full_disk_resumes_from_its_last_checkpoint(sequence: Path, whole
     assert len((out / "trajectory.txt").read_text().splitlines()) == 6
     done = call("--resume", out)
     assert done.exit_code == 0 and f"resuming after 6 of {FRAMES} frames" in done.stdout, done.stderr
-    assert_same_results(out, whole_run)
+    assert_same_maps(out, whole_run)
 
 
 def fail_to_write(*_: object, **__: object) -> None:
@@ -211,7 +200,7 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
     assert (metrics.failure, metrics.processed) == (message, FRAMES)
     done = call("--resume", out)
     assert done.exit_code == 0 and f"resuming after {FRAMES} of {FRAMES} frames" in done.stdout, done.stderr
-    assert_same_results(out, whole_run)
+    assert_same_maps(out, whole_run)
 
 
 def test_folder_in_the_way_to_resume_is_quoted(tmp_path: Path) -> None:
@@ -234,7 +223,7 @@ def test_message_of_ctrl_c_while_results_are_written_names_the_way_to_resume(
         done = call(*run_arguments(sequence, out, "--save-masks", *CHECKPOINT_EVERY_FRAME))
     assert_error_line(done, f"{out}: interrupted before the results were written; resume with --resume {out}")
     assert call("--resume", out).exit_code == 0
-    assert_same_results(out, whole_run)
+    assert_same_maps(out, whole_run)
 
 
 def test_errors_of_results_and_recording_are_both_reported(
@@ -307,7 +296,7 @@ def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
     done = call("--resume", out)
     assert done.exit_code == 0, done.stderr
     assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
-    assert_same_results(out, whole_run)
+    assert_same_maps(out, whole_run)
 
 
 @pytest.mark.parametrize("earlier", [b"the map of yesterday", None])
@@ -520,7 +509,7 @@ def test_run_resumes_if_only_frames_that_were_not_processed_have_changed(
     assert expected.exit_code == 0, expected.stderr
     done = call("--resume", out, "--seq", tmp_path / "seq")
     assert done.exit_code == 0, done.stderr
-    assert_same_results(out, tmp_path / "expected")
+    assert_same_maps(out, tmp_path / "expected")
 
 
 def test_resumed_run_ignores_data_folder_of_the_environment(
@@ -571,7 +560,7 @@ def test_interrupted_run_of_a_batch_resumes(sequence: Path, tmp_path: Path) -> N
     frames: list[int] = []
     assert run_job(job("b"), frames.append) is None
     assert frames == list(range(7, FRAMES + 1))
-    assert_same_results(tmp_path / "b", tmp_path / "a", DEFAULT_RESULTS)
+    assert_same_results(tmp_path / "b", tmp_path / "a")
     # With another configuration, the run starts again with the first frame.
     assert run_job(job("c"), stop) is not None
     frames.clear()
@@ -592,7 +581,7 @@ def test_run_in_loaded_map_resumes_without_the_map_file(sequence: Path, whole_ru
     done = call("--resume", tmp_path / "b")
     assert done.exit_code == 0, done.stderr
     assert "loaded map" in done.stdout
-    assert_same_results(tmp_path / "b", tmp_path / "a")
+    assert_same_maps(tmp_path / "b", tmp_path / "a")
 
 
 def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:

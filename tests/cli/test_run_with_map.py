@@ -10,7 +10,7 @@ import plyfile
 import pytest
 import torch
 from helpers.commands import assert_error_line, call_here, files_in
-from helpers.walls import CAMERA, Slide
+from helpers.long_wall import CAMERA, Slide
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory

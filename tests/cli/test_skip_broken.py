@@ -13,10 +13,10 @@ from threading import Event
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from helpers.commands import assert_error_line, invoke
+from helpers.commands import assert_error_line, assert_same_results, invoke
 from helpers.corpus import base
 from helpers.corpus.outputs import at_frame
-from helpers.walker_folder import write_walker
+from helpers.tum_folder_with_person import write_walker
 from typer.testing import Result
 
 from v3d_torch.batch import runner
@@ -62,14 +62,6 @@ def call(sequence: Path, out: Path, *more: str) -> Result:
 def serial(broken: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     out = tmp_path_factory.mktemp("serial") / "out"
     return out, call(broken, out, "--skip-broken", "--serial")
-
-
-def assert_same_results(out: Path, expected: Path) -> None:
-    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply"):
-        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
-    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (out, expected))
-    for key in ("ate", "coverage", "status", "frames", "processed", "skipped", "keyframes", "failure"):
-        assert first[key] == second[key], key
 
 
 def test_broken_frames_are_skipped_and_counted(broken: Path, serial: tuple[Path, Result]) -> None:

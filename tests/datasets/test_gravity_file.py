@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.walls import CAMERA, Slide
+from helpers.long_wall import CAMERA, Slide
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.gravity_file import GRAVITY_FILE, read_gravity_file, write_gravity_file

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from itertools import islice
 
 import pytest
-from helpers.wall_run import CAMERA, FRAMES, StoredWall
+from helpers.short_wall import CAMERA, FRAMES, StoredWall
 
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.datasets.realtime_playback import RealtimePlayback, stored_source

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.damaged_folders import assert_ground_truth_is_left_out
 from helpers.tiny_images import as_rgb, colour_of, depth_of, save
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.seven_scenes import CAMERA, SevenScenesSequence
-from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import GroundTruthWarning
 
 
 @pytest.fixture
@@ -39,11 +38,9 @@ def test_seven_scenes_frames_match_files(folder: Path) -> None:
 
 
 def test_missing_and_damaged_poses_give_no_ground_truth(folder: Path) -> None:
-    (folder / "frame-000000.pose.txt").write_text("no pose")
-    with pytest.warns(GroundTruthWarning):
-        sequence = load_sequence(str(folder))
-    assert isinstance(sequence, StoredSequence) and sequence.groundtruth is None
-    assert str(sequence.groundtruth_error).startswith(f"{folder / 'frame-000000.pose.txt'}: is not a 3x3 or 4x4 matrix")
+    file = folder / "frame-000000.pose.txt"
+    file.write_text("no pose")
+    assert_ground_truth_is_left_out(folder, file, "is not a 3x3 or 4x4 matrix")
     for path in folder.glob("*.pose.txt"):
         path.unlink()
     assert load_sequence(str(folder)).groundtruth is None

@@ -17,8 +17,8 @@ import torch
 from helpers.bag_messages import matrix_of
 from helpers.bags import MessageFactory
 from helpers.fake_ros import FakeROS, Pair
+from helpers.short_wall import CAMERA, FRAMES, STEP, WALL, Wall
 from helpers.waiting import wait_until
-from helpers.wall_run import CAMERA, FRAMES, STEP, WALL, Wall
 from rosbags.typesys import Stores, get_typestore
 
 from v3d_torch.export.ros.frames import map_frame

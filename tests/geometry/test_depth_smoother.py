@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.library_settings import default_dtype
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
@@ -129,15 +128,6 @@ def test_image_without_pixels_stays_as_it_is(shape: tuple[int, ...], dtype: torc
     depth = torch.zeros(shape, dtype=dtype)
     smoothed = smooth_depth(depth)
     assert smoothed.shape == shape and smoothed.dtype == dtype
-
-
-def test_default_dtype_does_not_change_the_result() -> None:
-    given = stepped_depth(30, 40, torch.float32)
-    expected = smooth_depth(given)
-    with default_dtype(torch.float64):
-        found = smooth_depth(given)
-    assert found.dtype == torch.float32
-    assert torch.equal(found, expected)
 
 
 @pytest.mark.parametrize("kernel_size", [0, 4])

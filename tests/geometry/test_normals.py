@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.library_settings import default_dtype
-from helpers.rooms import CAMERA
+from helpers.box_room import CAMERA
 from torch import Tensor
 
 from v3d_torch.geometry.camera import back_project
@@ -41,15 +40,6 @@ def test_normals_of_a_batch_equal_normals_of_each_image() -> None:
     normals = surface_normals(batch)
     for points, expected in zip(batch, normals, strict=True):
         assert torch.equal(surface_normals(points[None])[0], expected)
-
-
-def test_default_dtype_does_not_change_the_result() -> None:
-    given = slanted([0.5, 0.1, -1], 2.0)[0].to(torch.float32)
-    expected = surface_normals(given)
-    with default_dtype(torch.float64):
-        found = surface_normals(given)
-    assert found.dtype == torch.float32
-    assert torch.equal(found, expected)
 
 
 def test_edges_and_holes_have_no_normals() -> None:

@@ -8,6 +8,9 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.plan import load_configs, plan_jobs
 from v3d_torch.datasets import load_sequence
 
+ENDLESS = 2000
+"""Number of frames of a sequence that does not end before an interrupt, however busy the machine is."""
+
 
 def repeat_sequence(moment: Path, folder: Path, frames: int) -> Path:
     """Write a sequence that plays the frames of `moment` forwards and backwards, without ground truth.

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from contextlib import chdir
 from pathlib import Path
 
 from typer import Typer
 from typer.testing import CliRunner, Result
 
+from helpers.folders import names_in
 from v3d_torch.cli import run
 
 RUN_FILES = {
@@ -19,6 +22,15 @@ RUN_FILES = {
     *("figures/trajectory.png", "figures/masks.png"),
 }
 """Files that every run with ground truth writes."""
+
+REPEATABLE_FILES = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply")
+"""Files of every run that are the same to the byte if the run is repeated."""
+
+REPEATABLE_METRICS = (
+    *("ate", "rpe", "coverage", "status", "frames", "processed", "skipped", "keyframes", "landmarks", "loops"),
+    "failure",
+)
+"""Keys of ``metrics.json`` whose values are the same if the run is repeated."""
 
 
 def command(*arguments: str | Path) -> list[str]:
@@ -60,6 +72,23 @@ def assert_error_line(done: subprocess.CompletedProcess[str] | Result, *words: s
     assert "Traceback" not in done.stdout + done.stderr
     for word in words:
         assert str(word) in done.stderr
+
+
+def assert_same_results(out: Path, expected: Path, files: Sequence[str] = REPEATABLE_FILES) -> None:
+    """Check that the folders of two runs have the same files with the same poses, objects, maps and scores.
+
+    Args:
+        out: Folder of a run.
+        expected: Folder of another run.
+        files: Files whose bytes are compared.
+    """
+    for name in files:
+        assert (out / name).read_bytes() == (expected / name).read_bytes(), name
+    first, second = (json.loads((folder / "metrics.json").read_text()) for folder in (out, expected))
+    for key in REPEATABLE_METRICS:
+        assert first[key] == second[key], key
+    names = [set(names_in(folder)) - {"figures"} for folder in (out, expected)]
+    assert names[0] == names[1]
 
 
 def files_in(folder: Path) -> set[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,16 +14,23 @@ from helpers.commands import environment
 from v3d_torch.batch.process_executor import start_method
 
 
-def start_forked(*arguments: str | Path, cwd: Path, output: Path = Path(os.devnull), **variables: str) -> BaseProcess:
+def start_forked(
+    *arguments: str | Path,
+    cwd: Path,
+    output: Path = Path(os.devnull),
+    before: Callable[[], object] | None = None,
+    **variables: str,
+) -> BaseProcess:
     """Start the command in a process of its own, which has an exit code and can be killed.
 
     Args:
         arguments: Arguments of the command.
         cwd: Working directory.
         output: Folder for the files ``stdout`` and ``stderr`` of the process; by default, its output is lost.
+        before: Function of a module in `helpers` that the process calls before the command.
         variables: Changes of the environment.
     """
-    given = list(map(str, arguments)), cwd, output, environment(**variables)
+    given = list(map(str, arguments)), cwd, output, before, environment(**variables)
     process = start_method().Process(target=_run, args=given)
     process.start()
     return process
@@ -39,7 +46,13 @@ def call_forked(*arguments: str | Path, cwd: Path, **variables: str) -> subproce
     return subprocess.CompletedProcess(arguments, process.exitcode, stdout, stderr)
 
 
-def _run(arguments: list[str], cwd: Path, output: Path, environment: Mapping[str, str]) -> None:
+def _run(
+    arguments: list[str],
+    cwd: Path,
+    output: Path,
+    before: Callable[[], object] | None,
+    environment: Mapping[str, str],
+) -> None:
     """Run the command; main function of the process."""
     from v3d_torch.cli import run
 
@@ -52,4 +65,6 @@ def _run(arguments: list[str], cwd: Path, output: Path, environment: Mapping[str
         os.dup2(file, descriptor)
         os.close(file)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked if a batch started the server
+    if before is not None:
+        before()
     run.app(arguments)

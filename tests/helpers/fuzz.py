@@ -17,8 +17,8 @@ import atheris
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for the package helpers
 
 with atheris.instrument_imports(include=["v3d_torch", "yaml", "helpers", "tarfile", "zipfile", "PIL"]):
+    from helpers.fuzz_inputs import SEEDS
     from helpers.parsers import PARSERS, assert_valid, parse
-    from helpers.seeds import SEEDS
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from helpers.rooms import CAMERA, render
+from helpers.box_room import CAMERA, CRATE, looking_around, render
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.kernels.voxel_blocks import BITS, HIT, VOLUME
 from v3d_torch.occupancy.occupancy_map import OccupancyMap
@@ -30,6 +30,14 @@ def add_view(
     occupancy.integrate(
         view.depth, view.static, view.rays(CAMERA, config.stride), T_wc if pose_in_map is None else pose_in_map
     )
+
+
+def map_of_room(views: int, config: OccupancyConfig = CONFIG) -> OccupancyMap:
+    """Map of the room with the crate, from views in all directions."""
+    occupancy = OccupancyMap(config)
+    for number, T_wc in enumerate(looking_around(views)):
+        add_view(occupancy, number, T_wc, CRATE)
+    return occupancy
 
 
 def map_of(occupied: Tensor, free: Tensor, config: OccupancyConfig = CONFIG) -> OccupancyMap:

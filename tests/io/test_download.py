@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import socket
-import time
+import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -25,6 +25,8 @@ class Handler(BaseHTTPRequestHandler):
     """Serves CONTENT in the way that the path says, and records the requests."""
 
     requests: ClassVar[list[tuple[str, str | None]]] = []
+    ended: ClassVar[threading.Event] = threading.Event()
+    """Whether the test has ended, for which the path ``/stalled`` waits."""
 
     def do_GET(self) -> None:
         byte_range = self.headers.get("Range")
@@ -43,7 +45,7 @@ class Handler(BaseHTTPRequestHandler):
             self._answer(200, CONTENT[: len(CONTENT) // 2], length=len(CONTENT))
         elif self.path == "/stalled":
             self._answer(200, CONTENT[:1000], length=len(CONTENT))
-            time.sleep(1.5)
+            self.ended.wait()
         elif self.path == "/ranged" and byte_range:
             start = int(byte_range.removeprefix("bytes=").removesuffix("-"))
             if start >= len(CONTENT):
@@ -73,8 +75,10 @@ class Handler(BaseHTTPRequestHandler):
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setenv("no_proxy", "*")
     Handler.requests.clear()
+    Handler.ended.clear()
     with running_server(Handler) as address:
         yield address
+        Handler.ended.set()
 
 
 @pytest.fixture
@@ -151,10 +155,8 @@ def test_lost_connection_keeps_the_part_but_no_target(server: str, target: Path)
 
 
 def test_stalled_connection_times_out(server: str, target: Path) -> None:
-    start = time.monotonic()
     with pytest.raises(DownloadError, match=r"connection was lost .*timed out"):
         fetch(f"{server}/stalled", target, timeout=0.3)
-    assert time.monotonic() - start < 4  # the default timeout is 5 s
 
 
 @pytest.mark.parametrize(
@@ -196,15 +198,13 @@ def test_only_https_is_accepted(target: Path, url: str) -> None:
         fetch(url, target)
 
 
-def test_refused_connection_fails_immediately(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refused_connection_is_an_error(target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("no_proxy", "*")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    start = time.monotonic()
     with pytest.raises(DownloadError, match=r"cannot be reached .*refused"):
         fetch(f"http://127.0.0.1:{port}/file", target)
-    assert time.monotonic() - start < 4
 
 
 def test_unwritable_folder_is_an_output_error(server: str, tmp_path: Path) -> None:

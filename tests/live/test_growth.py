@@ -9,7 +9,7 @@ from itertools import chain, pairwise
 
 import torch
 from helpers.paced_frames import paced
-from helpers.walk_run import CAMERA, CONFIG, FORWARD, Walk, segment_red
+from helpers.walk_with_loop import CAMERA, CONFIG, FORWARD, Walk, segment_red
 
 from v3d_torch.config.loading import override_config
 from v3d_torch.live import LiveSLAM

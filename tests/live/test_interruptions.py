@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.long_wall import CAMERA, Slide
 from helpers.paced_frames import paced
-from helpers.walls import CAMERA, Slide
 
 from v3d_torch.config import Config
 from v3d_torch.live import LiveResult, LiveSLAM

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import pytest
 
@@ -24,10 +24,15 @@ def test_newer_item_replaces_the_one_that_waits_but_not_the_first() -> None:
 
 
 def test_take_waits_for_an_item() -> None:
-    queue = LatestQueue[int]()
+    queue, begun = LatestQueue[int](), Event()
+
+    def take() -> int | None:
+        begun.set()
+        return queue.take()
+
     with ThreadPoolExecutor(1) as executor:
-        taken = executor.submit(queue.take)
-        time.sleep(0.02)
+        taken = executor.submit(take)
+        begun.wait()
         assert not taken.done()
         queue.put(7)
         assert taken.result(timeout=5) == 7

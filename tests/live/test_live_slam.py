@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, Wall, square
+from helpers.short_wall import CAMERA, FRAMES, Wall, square
+from helpers.waiting import wait_until
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -74,14 +75,15 @@ def test_each_result_has_state_and_times() -> None:
 def test_pose_is_known_before_the_network_has_found_the_objects() -> None:
     source, send = feed()
     step = float(Wall().groundtruth.T_wc[1, 0, 3])
-    is_known: list[bool] = []
+    waited_for: list[int] = []
 
     def segment(frame: RGBDFrame) -> Instances:
-        deadline = time.monotonic() + 10
-        while frame.index == 1 and not is_known and time.monotonic() < deadline:
-            if float(live.pose_at(frame.stamp).T_wc[0, 3]) == pytest.approx(step, rel=0.1):
-                is_known.append(True)
-            time.sleep(0.01)
+        if frame.index == 1:
+            pose = pytest.approx(step, rel=0.1)
+            wait_until(
+                lambda: float(live.pose_at(frame.stamp).T_wc[0, 3]) == pose, timeout=10, what="the pose is known"
+            )
+            waited_for.append(frame.index)
         return square(frame)
 
     live = LiveSLAM(source, V3DSLAM(CAMERA, segment))
@@ -89,7 +91,7 @@ def test_pose_is_known_before_the_network_has_found_the_objects() -> None:
     for result in live:
         results.append(result)
         send()
-    assert is_known == [True]
+    assert waited_for == [1]
     first, *others = results
     assert first.pose_latency == first.latency  # without a frame before, no motion is measured
     for result in others:
@@ -99,15 +101,20 @@ def test_pose_is_known_before_the_network_has_found_the_objects() -> None:
 def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -> None:
     """All later frames come while the first one is tracked: two are ready or in preprocessing, and the last one."""
     source, send = feed()
+    all_captured = threading.Event()
+
+    def frames() -> Iterator[RGBDFrame]:
+        yield from source
+        all_captured.set()  # the queue of the capture holds the last frame, or it was taken already
 
     def on_result(result: LiveResult) -> None:
         if result.frame.index == 0:
             for _ in range(FRAMES):
                 send()
-            time.sleep(0.5)
+            wait_until(all_captured.is_set, timeout=100, what="all frames were captured")
 
     results: list[LiveResult] = []
-    live = LiveSLAM(source, V3DSLAM(CAMERA, square))
+    live = LiveSLAM(frames(), V3DSLAM(CAMERA, square))
     live(lambda result: (results.append(result), on_result(result)))
     indices = [result.frame.index for result in results]
     assert indices[0] == 0 and indices[-1] == FRAMES - 1 and len(indices) <= 4

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import torch
-from helpers.observed_scenes import CAMERA, DEPTH_SIGMA, Scene
+from helpers.bundle_scenes import CAMERA, DEPTH_SIGMA, Scene
 from torch import Tensor
 
 from v3d_torch.errors import InputError

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import walls
+from helpers import long_wall
 from helpers.unpickled_code import CreatesFile
 
 from v3d_torch.config.loading import load_config
@@ -28,7 +28,7 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
 
 CONFIG = load_config(overrides=["segmentation.source=none"])
-CAMERA = replace(walls.CAMERA, readout=None)
+CAMERA = replace(long_wall.CAMERA, readout=None)
 
 
 def random_map(keyframes: int = 4, seed: int = 0) -> StoredMap:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.walls import CAMERA, Slide
+from helpers.long_wall import CAMERA, Slide
 from torch import Tensor
 
 from v3d_torch.config import Config

@@ -6,7 +6,7 @@ from dataclasses import astuple
 
 import pytest
 import torch
-from helpers.observed_scenes import CAMERA, Scene
+from helpers.bundle_scenes import CAMERA, Scene
 from helpers.rolling_camera import KINECT
 from hypothesis import given, settings
 from hypothesis import strategies as st

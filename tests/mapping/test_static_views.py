@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from helpers.rooms import CAMERA, EYE, keyframe
+from helpers.box_room import CAMERA, EYE, keyframe
 
 from v3d_torch.geometry.camera import PinholeCamera, back_project
 from v3d_torch.geometry.se3 import se3_exp

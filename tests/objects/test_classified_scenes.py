@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.scenes import (
+from helpers.object_scenes import (
     CAMERA,
     CHAIR,
     COUCH,

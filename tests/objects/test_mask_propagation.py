@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers.boards import CAMERA, CHAIR, CLOUDS, DOG, HERE, PERSON, Board, BoardTracker, render
-from helpers.scenes import ObjectStage
+from helpers.object_scenes import ObjectStage
 from torch import Tensor
 
 from v3d_torch import V3DSLAM, RGBDFrame, load_config, load_sequence

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.scenes import NO_FEATURES, ObjectStage
+from helpers.object_scenes import NO_FEATURES, ObjectStage
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 

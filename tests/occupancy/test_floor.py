@@ -6,8 +6,8 @@ import math
 
 import pytest
 import torch
+from helpers.box_room import ROOM
 from helpers.occupancy_scenes import CONFIG, add_view, box_of_voxels, map_of
-from helpers.rooms import ROOM
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import se3_exp

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers.box_room import ROOM
 from helpers.occupancy_scenes import CONFIG, add_view, box_of_voxels, map_of
-from helpers.rooms import ROOM
 from torch import Tensor
 
 from v3d_torch.config.loading import load_config

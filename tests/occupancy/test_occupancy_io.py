@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.occupancy_scenes import CONFIG, add_view
-from helpers.rooms import CRATE, looking_around
+from helpers.occupancy_scenes import CONFIG, map_of_room
 
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.errors import InputError
@@ -24,10 +23,7 @@ FLOOR = Floor(torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64), -1.2, 3.5)
 
 @pytest.fixture(scope="module")
 def room() -> OccupancyMap:
-    occupancy = OccupancyMap(CONFIG.model_copy(update={"max_distance": 0.7}))
-    for number, T_wc in enumerate(looking_around(4)):
-        add_view(occupancy, number, T_wc, CRATE)
-    return occupancy
+    return map_of_room(views=4, config=CONFIG.model_copy(update={"max_distance": 0.7}))
 
 
 def test_loaded_map_answers_as_the_saved_one(room: OccupancyMap, tmp_path: Path) -> None:

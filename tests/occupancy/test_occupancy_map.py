@@ -7,8 +7,8 @@ import logging
 import numpy as np
 import pytest
 import torch
-from helpers.occupancy_scenes import ALL, CONFIG, add_view, box_of_voxels, map_of
-from helpers.rooms import CAMERA, CRATE, distance_to, looking_around, render
+from helpers.box_room import CAMERA, CRATE, distance_to, looking_around, render
+from helpers.occupancy_scenes import ALL, CONFIG, add_view, box_of_voxels, map_of, map_of_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
@@ -27,11 +27,7 @@ EYE = torch.eye(4, dtype=torch.float64)
 
 @pytest.fixture(scope="module")
 def room() -> OccupancyMap:
-    """Map of the room with a crate from forty poses."""
-    occupancy = OccupancyMap(CONFIG)
-    for number, T_wc in enumerate(looking_around(40)):
-        add_view(occupancy, number, T_wc, CRATE)
-    return occupancy
+    return map_of_room(views=40)
 
 
 @pytest.fixture(scope="module")
@@ -96,15 +92,9 @@ def test_empty_map_is_unknown_everywhere() -> None:
 
 
 def test_map_does_not_depend_on_the_implementation(monkeypatch: pytest.MonkeyPatch) -> None:
-    def build() -> OccupancyMap:
-        occupancy = OccupancyMap(CONFIG)
-        for number, T_wc in enumerate(looking_around(3)):
-            add_view(occupancy, number, T_wc, CRATE)
-        return occupancy
-
-    first = build()
+    first = map_of_room(views=3)
     monkeypatch.setattr(compiler, "ENABLED", False)
-    second = build()
+    second = map_of_room(views=3)
     assert torch.equal(first.blocks.log_odds, second.blocks.log_odds)
     assert torch.equal(first.blocks.coordinates, second.blocks.coordinates)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.rooms import CAMERA, CRATE, keyframe, looking_around, render
+from helpers.box_room import CAMERA, CRATE, keyframe, looking_around, render
 from helpers.waiting import steps_until
 from torch import Tensor
 

@@ -8,8 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from helpers.occupancy_scenes import CONFIG, add_view, box_of_voxels, map_of
-from helpers.rooms import CRATE, looking_around
+from helpers.occupancy_scenes import CONFIG, box_of_voxels, map_of, map_of_room
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
@@ -29,10 +28,7 @@ def octomap() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def room() -> OccupancyMap:
-    occupancy = OccupancyMap(CONFIG)
-    for number, T_wc in enumerate(looking_around(8)):
-        add_view(occupancy, number, T_wc, CRATE)
-    return occupancy
+    return map_of_room(views=8)
 
 
 def read(path: Path) -> tuple[dict[str, str], dict[tuple[int, ...], int]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.rooms import CAMERA
+from helpers.box_room import CAMERA
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor

@@ -15,10 +15,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
-from helpers import walls
+from helpers import long_wall
+from helpers.long_wall import Slide
 from helpers.moving_camera import keyframe
-from helpers.wall_run import CAMERA, FRAMES, WALL, StoredWall, Wall, make_pipeline, run_along_wall, square
-from helpers.walls import Slide
+from helpers.short_wall import CAMERA, FRAMES, WALL, StoredWall, Wall, make_pipeline, run_along_wall, square
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -331,7 +331,7 @@ def test_camera_is_checked_when_its_own_run_has_enough_keyframes(monkeypatch: py
 class Jump:
     """Frames at one end of a long wall, then at its other end."""
 
-    name, camera, groundtruth = "jump", walls.CAMERA, None
+    name, camera, groundtruth = "jump", long_wall.CAMERA, None
 
     def __iter__(self) -> Iterator[RGBDFrame]:
         frames = [
@@ -342,7 +342,7 @@ class Jump:
 
 def test_part_of_the_map_whose_place_is_a_guess_is_uncertain_and_not_in_the_point_map() -> None:
     config = load_config(None, ("segmentation.source=none", "mapping.restart_after=0.3"))
-    pipeline = Pipeline(Jump(), V3DSLAM(walls.CAMERA, config=config))
+    pipeline = Pipeline(Jump(), V3DSLAM(long_wall.CAMERA, config=config))
     results: list[FrameResult] = []
     pipeline(lambda frame, result: results.append(result))
     pipeline.flush()
@@ -351,7 +351,7 @@ def test_part_of_the_map_whose_place_is_a_guess_is_uncertain_and_not_in_the_poin
     assert len(disconnected) > 10
     for each in disconnected:  # a few tenths of a second after the last frame that was found
         assert each.covariance[:3, :3].diagonal().sqrt().min() > 0.2
-    first, last = (walls.DISTANCE / walls.CAMERA.fx * column for column in (-159.5, 200 + 160.5))
+    first, last = (long_wall.DISTANCE / long_wall.CAMERA.fx * column for column in (-159.5, 200 + 160.5))
     assert len(points) > 1000 and first - 0.05 < points[:, 0].min() and points[:, 0].max() < last + 0.05
     (warning,) = [each for each in pipeline.record.warnings if "only a guess" in each]
     count = pipeline.slam.poses.statuses.count(TrackingStatus.DISCONNECTED)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, square
+from helpers.short_wall import CAMERA, FRAMES, WALL, Wall, square
 from torch import Tensor
 
 from v3d_torch.pipeline import Pipeline

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from helpers.fuzz_inputs import SEEDS
 from helpers.parsers import PARSERS, assert_valid, parse
-from helpers.seeds import SEEDS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from helpers.rooms import CAMERA, CRATE, looking_around, render
+from helpers.box_room import CAMERA, CRATE, looking_around, render
 from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig

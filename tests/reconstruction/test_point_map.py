@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from helpers.rooms import CAMERA, CRATE, EYE, ROOM, distance_to, keyframe, looking_around, render
+from helpers.box_room import CAMERA, CRATE, EYE, ROOM, distance_to, keyframe, looking_around, render
 from scipy.ndimage import binary_erosion, generate_binary_structure
 from torch import Tensor
 

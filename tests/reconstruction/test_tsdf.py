@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from helpers.rooms import CAMERA, CRATE, EYE, ROOM, distance_to, keyframe, looking_around, render
+from helpers.box_room import CAMERA, CRATE, EYE, ROOM, distance_to, keyframe, looking_around, render
 from scipy.spatial import KDTree
 from torch import Tensor
 

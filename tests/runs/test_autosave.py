@@ -7,7 +7,7 @@ from pathlib import Path
 from threading import Event
 
 import pytest
-from helpers.wall_run import FRAMES, Wall, run_along_wall
+from helpers.short_wall import FRAMES, Wall, run_along_wall
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.realtime_playback import RealtimePlayback

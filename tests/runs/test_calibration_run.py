@@ -7,7 +7,7 @@ from io import StringIO
 from unittest.mock import MagicMock, Mock
 
 import pytest
-from helpers.rooms import CAMERA
+from helpers.box_room import CAMERA
 from rich.console import Console
 
 from v3d_torch.calibration.camera_calibration import Calibration

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.walk_run import CONFIG, Walk, interrupt_after, make_pipeline, segment_red
+from helpers.walk_with_loop import CONFIG, Walk, interrupt_after, make_pipeline, segment_red
 
 from v3d_torch.errors import OutputError
 from v3d_torch.frame_result import FrameResult

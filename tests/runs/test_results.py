@@ -16,7 +16,7 @@ import plyfile
 import pyarrow.parquet as pq
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, WALL, Wall, run_along_wall
+from helpers.short_wall import CAMERA, FRAMES, WALL, Wall, run_along_wall
 from scipy.spatial.transform import Rotation
 
 from v3d_torch.config import Config

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.wall_run import CAMERA, FRAMES, StoredWall, Wall, square
+from helpers.short_wall import CAMERA, FRAMES, StoredWall, Wall, square
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config

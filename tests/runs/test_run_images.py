@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 import torch
-from helpers.wall_run import FRAMES, StoredWall, Wall
+from helpers.short_wall import FRAMES, StoredWall, Wall
 
 from v3d_torch.datasets import RGBDStream
 from v3d_torch.errors import InputError

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.walk_run import CAMERA, CONFIG, Walk, interrupt_after, make_pipeline, segment_red
+from helpers.walk_with_loop import CAMERA, CONFIG, Walk, interrupt_after, make_pipeline, segment_red
 
 from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.config.loading import load_config

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.walk_run import CAMERA, CONFIG, Walk, make_pipeline, segment_red
+from helpers.walk_with_loop import CAMERA, CONFIG, Walk, make_pipeline, segment_red
 from torch import nn
 
 from v3d_torch.errors import ConfigError

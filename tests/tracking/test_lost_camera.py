@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.walls import CAMERA, Slide
+from helpers.long_wall import CAMERA, Slide
 
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence

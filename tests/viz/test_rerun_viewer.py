@@ -6,7 +6,6 @@ import os
 import signal
 import socket
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,9 @@ import pytest
 import rerun_cli
 import torch
 from helpers.demo_frames import copy_frames
-from helpers.squares import squares
-from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
+from helpers.short_wall import CAMERA, FRAMES, WALL, Wall
+from helpers.square_segmenter import squares
+from helpers.waiting import wait_until
 from matplotlib.colors import to_rgba
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
@@ -478,10 +478,7 @@ def test_viewer_is_started_and_receives_the_run(
     pipeline.flush()
     pipeline.fuse_points()
     assert list(Recording(file).at("/world/camera")) == [0, 1, 2]
-    deadline = time.monotonic() + 20
-    while (not saved.is_file() or saved.stat().st_size < 10_000) and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert saved.stat().st_size > 10_000
+    wait_until(lambda: saved.is_file() and saved.stat().st_size > 10_000, timeout=20, what="the viewer saved the run")
 
 
 def test_command_without_screen_suggests_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

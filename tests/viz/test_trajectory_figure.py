@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.pictures import count_pixels, read_picture
+from helpers.figure_pixels import count_pixels, read_picture
 from helpers.trajectories import arc, shaken
 
 from v3d_torch.errors import OutputError

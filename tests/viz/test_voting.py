@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from helpers.pictures import count_pixels, is_colour, read_picture
+from helpers.figure_pixels import count_pixels, is_colour, read_picture
 from numpy.typing import NDArray
 
 from v3d_torch.viz.object_overlay import Overlay

@@ -310,10 +310,8 @@ def test_camera_file_without_a_size_has_that_of_the_device(tmp_path: Path) -> No
 def test_missing_camera_is_an_input_error(name: str, label: str) -> None:
     if rs.context().query_devices().size():
         pytest.skip("a camera is connected")
-    start = time.monotonic()
     with pytest.raises(InputError, match=f"^{label}: no camera is connected; plug it into a USB 3 port$"):
         open_source(name)
-    assert time.monotonic() - start < 5
     with pytest.raises(InputError, match="is a live camera, which does not support --depth-topic; remove this option"):
         open_source(name, options=SourceOptions(depth_topic="/a"))
 

@@ -19,8 +19,8 @@ from helpers.bag_messages import (
     read_with_rosbags,
     stamp_of,
 )
-from helpers.squares import squares
-from helpers.wall_run import CAMERA, FRAMES, WALL, Wall
+from helpers.short_wall import CAMERA, FRAMES, WALL, Wall
+from helpers.square_segmenter import squares
 from mcap.reader import make_reader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader

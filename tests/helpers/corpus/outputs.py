@@ -24,7 +24,7 @@ from helpers.corpus.case import (
     fails_at_frame,
     write,
 )
-from helpers.corpus.privileges import without_root_rights
+from helpers.privileges import without_root_rights
 from v3d_torch.datasets.tum import TUMSequence
 
 
