@@ -31,7 +31,7 @@ def test_free_space_of_points_equals_its_twin(camera: PinholeCamera, measured: f
     points[:1] = torch.nan
     found, expected = (
         f(points, view(measured, 0.1), camera, FreeSpaceConfig())
-        for f in TWINS[f"{free_space_check.__name__}.is_free_space"]
+        for f in TWINS[f"{free_space_check.__name__}.observe_free_space"]
     )
     assert torch.equal(found.nan_to_num(2), expected.nan_to_num(2))
 

@@ -22,7 +22,7 @@ from v3d_torch.objects import image_scale
 from v3d_torch.objects.free_space_check import (
     DepthView,
     FreeSpaceCheck,
-    is_free_space,
+    observe_free_space,
     vacated_fractions,
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
@@ -117,7 +117,7 @@ def test_vacated_fraction_is_the_uncovered_part_without_the_rim(step: int) -> No
 def test_hidden_points_are_unknown() -> None:
     """Of 20 columns 3 are free, 5 are occupied or beside something occupied, and 12 are hidden or at a rim."""
     observed = view(((65, 80), OBJECT), ((70, 80), 1.0))
-    known = is_free_space(surface((60, 80)).double(), observed, CAMERA, CONFIG).reshape(40, 20)
+    known = observe_free_space(surface((60, 80)).double(), observed, CAMERA, CONFIG).reshape(40, 20)
     expected = torch.tensor([1.0] * 3 + [0.0] * 5 + [torch.nan] * 12, dtype=torch.float64).expand(40, 20)
     torch.testing.assert_close(known, expected, rtol=0, atol=0, equal_nan=True)
     assert vacated_fraction(surface((60, 80)), observed) == pytest.approx(3 / 8)
@@ -227,7 +227,7 @@ def test_points_are_projected_with_lens_distortion(pixel: tuple[int, int]) -> No
     depth = torch.full((1, 480, 640), 1.0)
     depth[0, v - 6 : v + 7, u - 6 : u + 7] = WALL
     around = OBJECT * camera.rays[v - 1 : v + 2, u - 1 : u + 2].double().reshape(9, 3)
-    known = is_free_space(around, DepthView(0.0, depth, HERE), camera, CONFIG)
+    known = observe_free_space(around, DepthView(0.0, depth, HERE), camera, CONFIG)
     assert known[4] == 1.0 and known.isnan().sum() == 8
 
 
@@ -238,7 +238,7 @@ def test_lens_distortion_does_not_fold_points_into_the_image(degrees: float) -> 
     camera = PinholeCamera(542.822841, 542.576870, 315.593520, 237.756098, distortion=lens)
     aside = math.tan(math.radians(degrees))
     points = OBJECT * torch.tensor([[aside, 0.0, 1.0], [-aside, 0.0, 1.0], [0.0, aside, 1.0]], dtype=torch.float64)
-    known = is_free_space(points, DepthView(0.0, torch.full((1, 480, 640), WALL), HERE), camera, CONFIG)
+    known = observe_free_space(points, DepthView(0.0, torch.full((1, 480, 640), WALL), HERE), camera, CONFIG)
     assert known.isnan().tolist() == [degrees > 30.5, degrees > 30.5, True]
 
 
@@ -279,7 +279,7 @@ def check_with(*views: DepthView, **config: object) -> FreeSpaceCheck:
     """Return a free-space check with stored views."""
     check = FreeSpaceCheck(FreeSpaceConfig(**config), CAMERA)
     for observed in views:
-        check.add_view(observed, observed.T_cw)
+        check.add_view(observed, observed.T_dw)
     return check
 
 
@@ -390,7 +390,7 @@ def test_box_is_newly_occupied_over_each_time_span(rate: int) -> None:
                 assert row.isnan().all()
             else:
                 assert (box(row) == expected).all() and (around(row) == 0).all()
-        check.add_view(current, current.T_cw)
+        check.add_view(current, current.T_dw)
 
 
 def test_view_is_compared_with_the_newest_one_that_is_older_by_the_time_span() -> None:
@@ -405,7 +405,7 @@ def test_views_older_than_the_longest_time_span_are_dropped() -> None:
     check, stored, images = check_with(), [], []
     for frame in range(100):
         observed = view(at=frame / 10)
-        check.add_view(observed, observed.T_cw)
+        check.add_view(observed, observed.T_dw)
         stored.append(weakref.ref(observed.nearest_depth))
         images.append(weakref.ref(observed.depth))
     del observed
@@ -499,6 +499,6 @@ def test_state_dict_continues_with_identical_results() -> None:
         torch.testing.assert_close(
             original(current).appeared, continued(other).appeared, rtol=0, atol=0, equal_nan=True
         )
-        original.add_view(current, current.T_cw)
-        continued.add_view(other, other.T_cw)
+        original.add_view(current, current.T_dw)
+        continued.add_view(other, other.T_dw)
     assert not original(view(WITH_BOX, at=1.8)).appeared.isnan().all()

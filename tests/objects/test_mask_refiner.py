@@ -73,7 +73,7 @@ def refine(
     view = DepthView(0.0, depth, torch.eye(4, dtype=torch.float64))
     surfaces = StaticSurfaces(FreeSpaceConfig(), CAMERA)
     if static is not None:
-        surfaces.add_view(view, view.T_cw, static)
+        surfaces.add_view(view, view.T_dw, static)
     config = ObjectsConfig(clouds=CloudConfig(voxel_size=SPACING), static_mask=StaticMaskConfig(**mask))
     refiner = MaskRefiner([track], view, NewlyOccupied(appeared, STEP), surfaces, config, CAMERA)
     refined = refiner.refine(track)

@@ -762,7 +762,7 @@ class PaperStage:
         instances = Instances(masks, torch.full((count,), CHAIR), torch.ones(count), torch.zeros(count, 4))
         view = DepthView(self._frame / 30, torch.full((1, CAMERA.height, CAMERA.width), WALL), invert(T_wc))
         result = self._classify(instances, clouds, view, self._free_space_check(view), NO_FEATURES)
-        self._free_space_check.add_view(view, view.T_cw)
+        self._free_space_check.add_view(view, view.T_dw)
         self.vote_pairs = result.vote_pairs
         return {obj.id: obj for obj in result.objects}
 

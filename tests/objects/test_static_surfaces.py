@@ -40,7 +40,7 @@ def surfaces_with(*views: tuple[DepthView, Tensor], config: FreeSpaceConfig | No
     """Return surfaces with views and their static pixels."""
     surfaces = StaticSurfaces(config or FreeSpaceConfig(), CAMERA)
     for each, static in views:
-        surfaces.add_view(each, each.T_cw, static)
+        surfaces.add_view(each, each.T_dw, static)
     return surfaces
 
 

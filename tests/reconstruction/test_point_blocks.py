@@ -10,7 +10,7 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.free_space_check import is_free_space
+from v3d_torch.objects.free_space_check import observe_free_space
 from v3d_torch.reconstruction.point_blocks import PointBlocks
 
 
@@ -34,10 +34,10 @@ def test_no_point_that_a_view_observes_is_left_out(extent: float, tolerance: flo
     for k, T_wc in enumerate(looking_around(24)):
         roll = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.3 * k, 0.0, 0.2 * k], dtype=torch.float64))
         depth_view = view(T_wc @ roll, far=10.0 if k % 2 else 1.5)
-        state = is_free_space(points, depth_view, CAMERA, config)
+        state = observe_free_space(points, depth_view, CAMERA, config)
         rows = blocks.observable_by(depth_view, CAMERA, config)
         found = torch.full_like(state, torch.nan)
-        found[rows] = is_free_space(points[rows], depth_view, CAMERA, config)
+        found[rows] = observe_free_space(points[rows], depth_view, CAMERA, config)
         assert torch.equal(found.nan_to_num(2.0), state.nan_to_num(2.0)) and len(rows.unique()) == len(rows)
         observed += int((~state.isnan()).sum())
         left_out += len(points) - len(rows)

@@ -41,10 +41,10 @@ def _compare(
 
 
 @kernel("(f8[:,:], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4))")
-def is_free_space(
+def observe_free_space(
     points: Floats, T_cw: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds, limits: Limits
 ) -> Floats:
-    """Check whether points lie in space that a view observes as free.
+    """Return for each point whether a view observes its place as free.
 
     Args:
         points: Points, world frame, metres, (P, 3), in any memory order.

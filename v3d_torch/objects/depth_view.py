@@ -23,8 +23,8 @@ class SpaceView(Protocol):
     """Pose and nearest depth of a view: `DepthView` or `StoredView`."""
 
     @property
-    def T_cw(self) -> Tensor:
-        """World-to-camera pose, float64, shape :math:`(4, 4)`."""
+    def T_dw(self) -> Tensor:
+        """World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`."""
 
     @property
     def nearest_depth(self) -> Tensor:
@@ -39,12 +39,12 @@ class StoredView:
         stamp: Timestamp, seconds.
         nearest_depth: Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without
             depth.
-        T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+        T_dw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
     """
 
     stamp: float
     nearest_depth: Tensor
-    T_cw: Tensor
+    T_dw: Tensor
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class DepthView:
     Attributes:
         stamp: Timestamp, seconds.
         depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
-        T_cw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
+        T_dw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
         misalignment: Largest offset of the depth of a pixel from that pose, pixels. It arises when the camera turns
             while the image is read.
         is_motion_measured: True if the motion of the camera since the previous frame is measured; otherwise the pose is
@@ -63,7 +63,7 @@ class DepthView:
 
     stamp: float
     depth: Tensor
-    T_cw: Tensor
+    T_dw: Tensor
     misalignment: int = 0
     is_motion_measured: bool = True
 

@@ -36,18 +36,18 @@ def _limits(config: FreeSpaceConfig) -> kernels.Limits:
     return config.min_depth, config.max_depth, config.tolerance, config.min_tolerance
 
 
-def _is_free_space_compiled(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
+def _observe_compiled(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
     if points.dtype != torch.float64:
         return NotImplemented
-    pose, nearest_depth = to_array(view.T_cw), to_array(view.nearest_depth)
+    pose, nearest_depth = to_array(view.T_dw), to_array(view.nearest_depth)
     limits = _limits(config)
-    free = kernels.is_free_space(points.numpy(), pose, nearest_depth, camera.intrinsics, camera.bounds, limits)
+    free = kernels.observe_free_space(points.numpy(), pose, nearest_depth, camera.intrinsics, camera.bounds, limits)
     return torch.from_numpy(free)
 
 
-@compiled_by(_is_free_space_compiled)
-def is_free_space(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
-    """Check whether points lie in space that a view of another time observes as free.
+@compiled_by(_observe_compiled)
+def observe_free_space(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
+    """Return for each point whether a view of another time observes its place as free.
 
     Args:
         points: Points, world frame, metres, float64, shape :math:`(P, 3)`.
@@ -60,7 +60,7 @@ def is_free_space(points: Tensor, view: SpaceView, camera: PinholeCamera, config
         hidden, outside the image or without depth; float64, shape :math:`(P,)`.
     """
     # One contiguous row per coordinate: the operations below are faster on it.
-    in_camera = (view.T_cw[:3, :3] @ points.T + view.T_cw[:3, 3:]).T
+    in_camera = (view.T_dw[:3, :3] @ points.T + view.T_dw[:3, 3:]).T
     expected = in_camera[:, 2]
     pixels, inside = camera.project_to_image(in_camera, config.min_depth)
     u, v = pixels.round().to(torch.int64).unbind(dim=1)
@@ -79,13 +79,13 @@ def _newly_occupied_compiled(
     camera: PinholeCamera,
     config: FreeSpaceConfig,
 ) -> Tensor:
-    depth, T_wc, directions = to_array(view.depth[0]), to_array(invert(view.T_cw)), to_array(rays)
+    depth, T_wd, directions = to_array(view.depth[0]), to_array(invert(view.T_dw)), to_array(rays)
     appeared = np.full((len(earlier), -(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), np.nan)
     for row, previous in zip(appeared, earlier, strict=True):
         if previous is not None:
-            pose, nearest_depth = to_array(previous.T_cw), to_array(previous.nearest_depth)
+            pose, nearest_depth = to_array(previous.T_dw), to_array(previous.nearest_depth)
             observer = pose, nearest_depth, camera.intrinsics, camera.bounds, _limits(config)
-            kernels.newly_occupied(depth, stride, directions, T_wc, *observer, row)
+            kernels.newly_occupied(depth, stride, directions, T_wd, *observer, row)
     return torch.from_numpy(appeared)
 
 
@@ -114,12 +114,12 @@ def _newly_occupied(
     z = view.depth[0, ::stride, ::stride].to(torch.float64)
     appeared = torch.full((len(earlier), *z.shape), torch.nan, dtype=torch.float64)
     measured = torch.nonzero(((z > config.min_depth) & (z <= config.max_depth)).flatten())[:, 0]
-    T_wc = invert(view.T_cw)
+    T_wd = invert(view.T_dw)
     in_camera = rays.index_select(1, measured) * z.flatten().index_select(0, measured)
-    points = (T_wc[:3, :3] @ in_camera + T_wc[:3, 3:]).T
+    points = (T_wd[:3, :3] @ in_camera + T_wd[:3, 3:]).T
     for row, previous in zip(appeared.flatten(1), earlier, strict=True):
         if previous is not None:
-            row[measured] = is_free_space(points, previous, camera, config)
+            row[measured] = observe_free_space(points, previous, camera, config)
     return appeared
 
 
@@ -141,7 +141,7 @@ def vacated_fractions(
     if not clouds:
         return torch.zeros(0, dtype=torch.float64)
     points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
-    free = is_free_space(points, view, camera, config).numpy()
+    free = observe_free_space(points, view, camera, config).numpy()
     # NumPy counts faster here than torch.
     owner = np.arange(len(clouds)).repeat([len(cloud) for cloud in clouds])
     known = np.bincount(owner, ~np.isnan(free), len(clouds))
@@ -164,22 +164,22 @@ class FreeSpaceCheck(StoredViews):
         self._stride = coarse_stride(camera)
         self._rays = camera.rays[:: self._stride, :: self._stride].reshape(-1, 3).T.to(torch.float64)
 
-    def make_view(self, stamp: float, depth: Tensor, T_cw: Tensor, *, is_motion_measured: bool = True) -> DepthView:
+    def make_view(self, stamp: float, depth: Tensor, T_dw: Tensor, *, is_motion_measured: bool = True) -> DepthView:
         """Make a view. Its misalignment follows from the camera's rotation rate since the last stored view.
 
         Args:
             stamp: Timestamp, seconds.
             depth: Depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            T_dw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
             is_motion_measured: True if the motion of the camera since the previous frame is measured.
         """
         if not self._views:
-            return DepthView(stamp, depth, T_cw, is_motion_measured=is_motion_measured)
+            return DepthView(stamp, depth, T_dw, is_motion_measured=is_motion_measured)
         last = self._views[-1]
-        angle = float(np.linalg.norm(cv2.Rodrigues((T_cw @ invert(last.T_cw))[:3, :3].numpy())[0]))
+        angle = float(np.linalg.norm(cv2.Rodrigues((T_dw @ invert(last.T_dw))[:3, :3].numpy())[0]))
         rotation_rate = angle / max(stamp - last.stamp, MIN_INTERVAL)
         misalignment = round(self._camera.fx * rotation_rate * self._config.depth_sync_error)
-        return DepthView(stamp, depth, T_cw, misalignment, is_motion_measured)
+        return DepthView(stamp, depth, T_dw, misalignment, is_motion_measured)
 
     def __call__(self, view: DepthView, *, pose_known: bool = True) -> NewlyOccupied:
         """Compare a view with the stored views.
@@ -198,19 +198,19 @@ class FreeSpaceCheck(StoredViews):
         appeared = _newly_occupied(view, earlier, self._rays, self._stride, self._camera, config)
         return NewlyOccupied(appeared, self._stride)
 
-    def add_view(self, view: DepthView, T_cw: Tensor) -> None:
+    def add_view(self, view: DepthView, T_dw: Tensor) -> None:
         """Store a view with its final pose, and drop the views that are too old for all time spans.
 
         Nothing is stored if the check is turned off.
 
         Args:
             view: View, newer than all stored ones.
-            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            T_dw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
         """
         if not self._config.enabled:
             return
         max_age = max(self._config.time_spans, default=0.0) + _VIEW_MARGIN
-        self._store(StoredView(view.stamp, view.nearest_depth, T_cw), max_age)
+        self._store(StoredView(view.stamp, view.nearest_depth, T_dw), max_age)
 
     def _newest_view_before(self, stamp: float) -> StoredView | None:
         return next((view for view in reversed(self._views) if view.stamp <= stamp + STAMP_TOLERANCE), None)

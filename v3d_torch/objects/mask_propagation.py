@@ -45,7 +45,7 @@ def propagate_instances(
         Instances with the IDs and classes of the tracks, score 0 and empty boxes.
     """
     detected = [track for track in tracks if not track.missed and track.label != UNLABELLED]
-    projected = silhouettes(predict_clouds(detected, view.stamp, view.T_cw), camera, config.voxel_size)
+    projected = silhouettes(predict_clouds(detected, view.stamp, view.T_dw), camera, config.voxel_size)
     masks = {
         track: mask
         for track, each in zip(detected, projected, strict=True)

@@ -89,7 +89,7 @@ class MaskRefiner:
         # Distance that a refined mask reaches beyond the mask; surfaces are grown and filled in steps of the stride.
         self._reach = max(self._config.surface_margin, self._config.depth_margin) + 2 * self._stride
         with_centroid = [track for track in tracks if track.newest.has_centroid]
-        clouds = predict_clouds(with_centroid, view.stamp, view.T_cw)
+        clouds = predict_clouds(with_centroid, view.stamp, view.T_dw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
         projected = silhouettes(clouds, camera, self._spacing)
         self._silhouettes = dict(zip(with_centroid, zip(projected, median_depths, strict=True), strict=True))
@@ -194,7 +194,7 @@ class MaskRefiner:
         cloud = track.earlier_cloud()
         if cloud is None:
             return np.zeros(depth.shape[1:], np.bool_)
-        silhouette = silhouettes([transform_points(self._view.T_cw, cloud)], self._camera, self._spacing)[0]
+        silhouette = silhouettes([transform_points(self._view.T_dw, cloud)], self._camera, self._spacing)[0]
         origin = crop[0].start, crop[1].start
         return silhouette.mask(depth, 0, self._tolerance(track), stride=self._stride, origin=origin).numpy()
 

@@ -93,7 +93,7 @@ class MotionClassifier:
         # Ids; missed objects are predicted (Sec. II, III-C).
         if not view.is_motion_measured and self._last_stamp > -torch.inf:
             self.tracker.start_unregistered(stamp)
-        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_cw), appearance)
+        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_dw), appearance)
         detected = [track for track in tracks if not track.missed]
         time_spans = (*config.voting.time_spans, config.chamfer.time_span)
         pairs = detection_pairs(detected, time_spans, self.tracker.comparable_since)

@@ -16,7 +16,7 @@ from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.depth_view import DepthView, StoredView
-from v3d_torch.objects.free_space_check import is_free_space
+from v3d_torch.objects.free_space_check import observe_free_space
 from v3d_torch.objects.stored_views import StoredViews
 from v3d_torch.types import STAMP_TOLERANCE
 
@@ -57,27 +57,27 @@ class StaticSurfaces(StoredViews):
         rows, columns = np.nonzero(pixels.numpy())
         source = stride * rows, stride * columns
         depth = view.depth[0].numpy()[source].astype(np.float64)
-        T_wc = invert(view.T_cw).numpy()
-        points = (self._camera.rays.numpy()[source] * depth[:, None]) @ T_wc[:3, :3].T + T_wc[:3, 3]
+        T_wd = invert(view.T_dw).numpy()
+        points = (self._camera.rays.numpy()[source] * depth[:, None]) @ T_wd[:3, :3].T + T_wd[:3, 3]
         found = np.zeros(len(points), np.bool_)
         unknown = np.flatnonzero((depth > self._config.min_depth) & (depth <= self._config.max_depth))
         for earlier in reversed(self._views):
             if not unknown.size:
                 break
             of_unknown = torch.from_numpy(points[unknown])
-            is_free = is_free_space(of_unknown, earlier, self._camera, self._config).numpy()
-            found[unknown[is_free == 0]] = True
-            unknown = unknown[np.isnan(is_free)]
+            free = observe_free_space(of_unknown, earlier, self._camera, self._config).numpy()
+            found[unknown[free == 0]] = True
+            unknown = unknown[np.isnan(free)]
         static = torch.zeros_like(pixels)
         static.numpy()[rows, columns] = found
         return static
 
-    def add_view(self, view: DepthView, T_cw: Tensor, static: Tensor) -> None:
+    def add_view(self, view: DepthView, T_dw: Tensor, static: Tensor) -> None:
         """Store the static part of a view if the last one is old enough, and drop views that are too old.
 
         Args:
             view: View, newer than all stored ones.
-            T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
+            T_dw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
             static: Pixels of the static scene without people, bool, shape :math:`(H, W)`.
         """
         is_early = bool(self._views) and view.stamp < self._views[-1].stamp + _INTERVAL - STAMP_TOLERANCE
@@ -85,4 +85,4 @@ class StaticSurfaces(StoredViews):
             return
         # Without the people's depth first: the minimum around a pixel beside a person would be the person's.
         nearest_depth = replace(view, depth=view.depth * static).nearest_depth
-        self._store(StoredView(view.stamp, nearest_depth, T_cw), _TIME_SPAN)
+        self._store(StoredView(view.stamp, nearest_depth, T_dw), _TIME_SPAN)

@@ -32,7 +32,7 @@ class StoredViews:
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
-        self._views = [replace(view, T_cw=view.T_cw @ invert(T_new_old)) for view in self._views]
+        self._views = [replace(view, T_dw=view.T_dw @ invert(T_new_old)) for view in self._views]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored views."""

@@ -36,7 +36,7 @@ class PointBlocks:
         self._centres, self._radii = (low + high) / 2, (high - low).norm(dim=1) / 2 + _MARGIN
 
     def observable_by(self, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
-        """Return the points of all blocks that can have a point for which `is_free_space` is not NaN.
+        """Return the points of all blocks that can have a point for which `observe_free_space` is not NaN.
 
         Args:
             view: View.
@@ -46,7 +46,7 @@ class PointBlocks:
         Returns:
             Indices of points, each at most once, int64, shape :math:`(K,)`.
         """
-        x, y, z = (view.T_cw[:3, :3] @ self._centres.T + view.T_cw[:3, 3:]).unbind(dim=0)
+        x, y, z = (view.T_dw[:3, :3] @ self._centres.T + view.T_dw[:3, 3:]).unbind(dim=0)
         near, far = z - self._radii, z + self._radii
         # The depth minus its tolerance is a concave function of the depth, so it is least at one end.
         least = torch.minimum(_nearest_measurable(near, config), _nearest_measurable(far, config))

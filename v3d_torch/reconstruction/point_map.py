@@ -16,7 +16,7 @@ from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.geometry.voxel import Voxels, voxel_pool
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.free_space_check import is_free_space
+from v3d_torch.objects.free_space_check import observe_free_space
 from v3d_torch.reconstruction.point_blocks import PointBlocks
 
 _MIN_FREE_VIEWS = 3
@@ -126,7 +126,7 @@ def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfi
     for view in views:
         depth_view = DepthView(view.keyframe.stamp, view.depth[None], view.T_dw)
         rows = blocks.observable_by(depth_view, views.camera, config)
-        state = is_free_space(centres[rows], depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
+        state = observe_free_space(centres[rows], depth_view, views.camera, config)  # 1 free, 0 occupied, nan unknown
         free[rows] += state == 1
         occupied[rows] += state == 0
         free_since[rows] = (free_since[rows] + (state == 1)) * (state != 0)
