@@ -178,11 +178,10 @@ class MaskRefiner:
         object at its last detection is not lost.
         """
         stride, segmented = self._stride, track.mask.numpy()[crop]
-        cells = segmented[::stride, ::stride] & ~surface[::stride, ::stride]
-        cells &= self._new_surface[self._cells(crop)] | self._earlier_surface(track, crop)
-        # Contours are coarse: narrow parts along them are background that was not observed before.
-        kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
-        parts = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
+        parts = _wide_parts(segmented[::stride, ::stride] & ~surface[::stride, ::stride], stride)
+        if parts.any():  # seldom; the rest takes longer
+            parts &= self._new_surface[self._cells(crop)] | self._earlier_surface(track, crop)
+            parts = _wide_parts(parts, stride)
         if not parts.any():
             return surface
         pixels = upsample_nearest(parts, stride, surface.shape).numpy()
@@ -226,6 +225,12 @@ class MaskRefiner:
 
 def _dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     return dilate(torch.from_numpy(np.ascontiguousarray(mask)), pixels).numpy()
+
+
+def _wide_parts(cells: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:
+    """Remove narrow parts from cells of the network's mask, (h, w): they are background along its coarse contour."""
+    kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
+    return cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
 
 
 def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], Crop]:
