@@ -16,12 +16,13 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
-from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
 from v3d_torch.runtime.batches import (
     check_finite_arguments,

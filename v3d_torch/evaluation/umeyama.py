@@ -10,8 +10,7 @@ from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
-from v3d_torch.geometry.se3 import se3_exp, to_matrix
-from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
+from v3d_torch.geometry.se3 import differentiable_rotation, to_matrix
 from v3d_torch.runtime.batches import fill_padding
 
 
@@ -93,13 +92,4 @@ def nearest_rotation(M: Tensor) -> Tensor:
     U, _, Vh = torch.linalg.svd(finite)
     signs = torch.stack([*torch.ones_like(finite[..., :2, 0]).unbind(-1), torch.linalg.det(U @ Vh).sign()], dim=-1)
     R = torch.where(is_unknown, torch.nan, (U * signs[..., None, :]) @ Vh)  # the last sign excludes reflections
-    if not needs_gradient(M):
-        return R
-    # Gradient and negated Hessian of trace(exp(phi)^T A) by phi, with A = M R^T.
-    A = M @ R.mT
-    gradient = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
-    fixed = ((A + A.mT) / 2).detach()
-    H = fixed.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] * torch.eye(3, dtype=A.dtype, device=A.device)
-    phi = (torch.linalg.pinv(zero_if_not_finite(H - fixed)[0], hermitian=True) @ gradient[..., None])[..., 0]
-    turn = torch.cat([torch.zeros_like(phi), zero_with_gradient(phi)], dim=-1)
-    return se3_exp(turn)[..., :3, :3] @ R
+    return differentiable_rotation(R, M)

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from v3d_torch.geometry.gradients import zero_with_gradient
 from v3d_torch.geometry.se3 import hat, se3_exp
 from v3d_torch.kernels import sampson as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
-from v3d_torch.optim.implicit import jacobian, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, levenberg_marquardt, select
 from v3d_torch.runtime.batches import to_rows
 

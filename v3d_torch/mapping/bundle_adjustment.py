@@ -17,11 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
-from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import SCHUR_REGULARISATION

@@ -14,9 +14,10 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.gradients import zero_with_gradient
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.compiler import can_read
-from v3d_torch.optim.implicit import jacobian, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.reprojection import (
     chi_square,

@@ -16,11 +16,12 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
-from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import (
     DAMPING_SCHEDULE,
     POSE_TOLERANCE,
