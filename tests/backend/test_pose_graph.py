@@ -12,6 +12,7 @@ from helpers.gradients import check_gradients, count_graph_nodes
 from helpers.random_numbers import RandomNumbers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.backend.pose_graph import edge_errors, optimise_pose_graph
@@ -252,6 +253,29 @@ def test_index_out_of_range_is_rejected(index: int) -> None:
         optimise_pose_graph(graph.start, edges, graph.T_ij)
     with pytest.raises(InputError, match=r"edges has the type torch\.int32; give .* torch\.int64"):
         optimise_pose_graph(graph.start, graph.edges.to(torch.int32), graph.T_ij)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("information", (6, 6)),  # as many rows as edges
+        ("information", (1, 6, 6)),
+        ("information", (6, 6, 5)),
+        ("fixed", (1,)),
+        ("fixed", (6,)),
+        ("weights", (1,)),
+        ("weights", (6, 1)),
+        ("valid", (1,)),
+        ("valid", ()),
+    ],
+)
+def test_arguments_of_another_shape_are_rejected(name: str, shape: tuple[int, ...]) -> None:
+    """One matrix, weight or mask was used for all edges or poses."""
+    graph = Graph(poses=7, loops=0)
+    assert len(graph.edges) == 6
+    given = torch.ones(shape, dtype=torch.bool if name in ("fixed", "valid") else torch.float64)
+    with pytest.raises(ShapeError):
+        optimise_pose_graph(graph.start, graph.edges, graph.T_ij, **{name: given})
 
 
 # ---------------------------------------------------------------- gradients

@@ -117,6 +117,13 @@ def optimise_pose_graph(
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
     KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
+    if information is not None:
+        KORNIA_CHECK_SHAPE(information, ["*", str(measured.shape[-3]), "6", "6"])
+    if fixed is not None:
+        KORNIA_CHECK_SHAPE(fixed, ["*", str(initial.shape[-3])])
+    for column in (weights, valid):
+        if column is not None:
+            KORNIA_CHECK_SHAPE(column, ["*", str(measured.shape[-3])])
     graph, start = _prepare(initial, edges, measured, information, fixed, weights, valid, robust)
     with torch.no_grad():
         found = _minimise(start.detach(), *graph.detach(), iterations=iterations, tolerance=tolerance)
