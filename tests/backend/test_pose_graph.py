@@ -47,7 +47,7 @@ class Graph:
 
 
 def optimise_with_gtsam(graph: Graph, information: Tensor, kernel: float | None = None) -> tuple[Tensor, float]:
-    """Optimal poses and cost according to GTSAM, with Huber's kernel if a threshold is given."""
+    """Optimal poses and cost according to GTSAM, with Huber's loss if a threshold is given."""
     gtsam = pytest.importorskip("gtsam")  # not on Windows
     factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, T in enumerate(graph.start):
@@ -284,7 +284,7 @@ CONVERGED = {"iterations": 200, "tolerance": 1e-15, "robust": 1.2}
 
 
 def noisy_graph(batch: int) -> dict[str, Tensor]:
-    """Graphs with errors on both sides of the threshold of Huber's kernel, but not at it; one edge is padding."""
+    """Graphs with errors on both sides of the threshold of Huber's loss, but not at it; one edge is padding."""
     inputs = camera_inputs.graph(batch, 11, torch.float64)
     inputs["T_ij"][:, ::4] = inputs["T_ij"][:, ::4] @ se3_exp(torch.full((6,), 0.1, dtype=torch.float64))
     return inputs | {"valid": torch.arange(11).expand(batch, 11) != 7}

@@ -99,7 +99,7 @@ def optimise_pose_graph(
         valid: Mask of the edges that are not padding, bool, shape :math:`(*, E)`; None for all.
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
-        robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
+        robust: Error, in standard deviations, above which Huber's loss grows linearly; None for plain least squares.
 
     Returns:
         The poses of minimal cost, with the dtype of ``T_wc``, float32 for integers; costs at least in float32.
@@ -165,7 +165,7 @@ class _Graph(NamedTuple):
     information: Tensor  # (..., E, 6, 6)
     weights: Tensor  # (..., E)
     fixed: Tensor  # (..., N)
-    limit: Tensor  # (), squared error from which Huber's kernel is linear
+    limit: Tensor  # (), squared error from which Huber's loss is linear
 
     @property
     def is_fixed(self) -> Tensor:
@@ -304,7 +304,7 @@ class PoseGraphOptimiser(torch.nn.Module):
     Args:
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
-        robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
+        robust: Error, in standard deviations, above which Huber's loss grows linearly; None for plain least squares.
     """
 
     def __init__(self, iterations: int = 50, tolerance: float = 1e-6, robust: float | None = None) -> None:
