@@ -31,7 +31,7 @@ def gtsam_camera(K: Tensor) -> gtsam.Cal3_S2:
 
 
 def gtsam_bundles(T_cw: Tensor, points: Tensor, uv: Tensor, pose: Tensor, point: Tensor, K: Tensor, k: float) -> Solve:
-    """Bundle adjustments of pixels with Huber's kernel, the first pose of each fixed; poses ``T_cw`` (B, P, 4, 4)."""
+    """Bundle adjustments of pixels with Huber's loss, the first pose of each fixed; poses ``T_cw`` (B, P, 4, 4)."""
     noise = gtsam.noiseModel.Robust.Create(
         gtsam.noiseModel.mEstimator.Huber.Create(k), gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
     )

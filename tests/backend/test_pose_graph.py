@@ -12,6 +12,7 @@ from helpers.gradients import check_gradients
 from helpers.random_numbers import RandomNumbers
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.backend.pose_graph import edge_errors, optimise_pose_graph
@@ -46,7 +47,7 @@ class Graph:
 
 
 def optimise_with_gtsam(graph: Graph, information: Tensor, kernel: float | None = None) -> tuple[Tensor, float]:
-    """Optimal poses and cost according to GTSAM, with Huber's kernel if a threshold is given."""
+    """Optimal poses and cost according to GTSAM, with Huber's loss if a threshold is given."""
     gtsam = pytest.importorskip("gtsam")  # not on Windows
     factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k, T in enumerate(graph.start):
@@ -254,13 +255,36 @@ def test_index_out_of_range_is_rejected(index: int) -> None:
         optimise_pose_graph(graph.start, graph.edges.to(torch.int32), graph.T_ij)
 
 
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("information", (6, 6)),  # as many rows as edges
+        ("information", (1, 6, 6)),
+        ("information", (6, 6, 5)),
+        ("fixed", (1,)),
+        ("fixed", (6,)),
+        ("weights", (1,)),
+        ("weights", (6, 1)),
+        ("valid", (1,)),
+        ("valid", ()),
+    ],
+)
+def test_arguments_of_another_shape_are_rejected(name: str, shape: tuple[int, ...]) -> None:
+    """One matrix, weight or mask was used for all edges or poses."""
+    graph = Graph(poses=7, loops=0)
+    assert len(graph.edges) == 6
+    given = torch.ones(shape, dtype=torch.bool if name in ("fixed", "valid") else torch.float64)
+    with pytest.raises(ShapeError):
+        optimise_pose_graph(graph.start, graph.edges, graph.T_ij, **{name: given})
+
+
 # ---------------------------------------------------------------- gradients
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-15, "robust": 1.2}
 
 
 def noisy_graph(batch: int) -> dict[str, Tensor]:
-    """Graphs with errors on both sides of the threshold of Huber's kernel, but not at it; one edge is padding."""
+    """Graphs with errors on both sides of the threshold of Huber's loss, but not at it; one edge is padding."""
     inputs = camera_inputs.graph(batch, 11, torch.float64)
     inputs["T_ij"][:, ::4] = inputs["T_ij"][:, ::4] @ se3_exp(torch.full((6,), 0.1, dtype=torch.float64))
     return inputs | {"valid": torch.arange(11).expand(batch, 11) != 7}

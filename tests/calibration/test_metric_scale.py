@@ -25,8 +25,9 @@ def make_trajectory(
 def test_scale_is_found() -> None:
     moved = make_trajectory(scale=1.25)
     world = se3_exp(torch.tensor([1.0, -2.0, 0.5, 0.3, 0.9, -0.4], dtype=torch.float64))
-    scale, sigma = metric_scale(Trajectory(moved.stamps, world @ moved.T_wc), make_trajectory())  # type: ignore[misc]
-    assert scale == pytest.approx(1.25, rel=1e-6) and sigma < 1e-6
+    found = metric_scale(Trajectory(moved.stamps, world @ moved.T_wc), make_trajectory())
+    assert found is not None
+    assert found.ratio == pytest.approx(1.25, rel=1e-6) and found.sigma < 1e-6 and found.blocks == 10
 
 
 @pytest.mark.parametrize("scale", [0.2, 1.0, 5.0])

@@ -98,7 +98,7 @@ def test_uncertainty_agrees_with_the_errors_over_many_maps() -> None:
         problem = make_problem(TRUE, seed=seed, points=80)
         values, at = problem.minimise(names)
         error = values - expected
-        squared.append(float(error @ torch.linalg.solve(covariance(problem, at), error)) / len(names))
+        squared.append(float(error @ torch.linalg.solve(covariance(problem, at).covariance, error)) / len(names))
     assert 0.3 < sum(squared) / len(squared) < 1.5
 
 

@@ -33,21 +33,23 @@ def select(given: PinholeCamera, **settings: float) -> dict[str, Estimate]:
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "accepted", "reason"),
+    ("value", "sigma", "blocks", "accepted", "reason"),
     [
-        (5.0, 0.1, True, ""),
-        (5.0, 1.1, False, NOT_DETERMINED),
-        (5.0, math.inf, False, NOT_DETERMINED),
-        (math.nan, math.nan, False, NOT_DETERMINED),
-        (2.0, 1.0, False, AGREES),
-        (4.1, 1.0, False, AGREES),  # the standard deviation is accurate to a quarter of itself
-        (4.4, 1.0, True, ""),
+        (5.0, 0.1, 10, True, ""),
+        (5.0, 1.1, 10, False, NOT_DETERMINED),
+        (5.0, math.inf, 3, False, NOT_DETERMINED),
+        (math.nan, math.nan, 0, False, NOT_DETERMINED),
+        (2.0, 1.0, 10, False, AGREES),
+        (4.1, 1.0, 10, False, AGREES),  # the standard deviation is accurate to a quarter of itself
+        (4.4, 1.0, 10, True, ""),
+        (4.4, 1.0, 6, False, AGREES),  # less accurate
+        (6.0, 1.0, 6, True, ""),
     ],
 )
 def test_estimate_is_accepted_if_it_is_accurate_and_differs(
-    value: float, sigma: float, accepted: bool, reason: str
+    value: float, sigma: float, blocks: int, accepted: bool, reason: str
 ) -> None:
-    estimate = decide("x", 0.0, value, sigma, tolerance=1.0)
+    estimate = decide("x", 0.0, value, sigma, blocks, tolerance=1.0)
     assert (estimate.accepted, estimate.reason) == (accepted, reason)
 
 
@@ -100,8 +102,8 @@ def test_errors_that_last_longer_than_a_block_make_the_variance_larger() -> None
     _, at = problem.minimise(("fx",))
     drifting = at._replace(gradient=at.hessian[:, :, 0] * torch.linspace(-1, 1, len(at.hessian))[:, None].double())
     freedom = problem.residual_count / (problem.residual_count - problem.unknown_count)
-    short = freedom * jackknife_covariance(drifting.gradient, drifting.hessian)
-    assert float(covariance(problem, drifting)) > 1.2 * float(short)
+    short = freedom * jackknife_covariance(drifting.gradient, drifting.hessian).covariance
+    assert float(covariance(problem, drifting).covariance) > 1.2 * float(short)
 
 
 def test_variance_is_at_least_that_of_independent_errors() -> None:
@@ -110,7 +112,7 @@ def test_variance_is_at_least_that_of_independent_errors() -> None:
     _, at = problem.minimise(("fx", "cx"))
     agreeing = at._replace(gradient=torch.full_like(at.gradient, 1e-9))
     independent = torch.linalg.inv(at.hessian.sum(dim=0) / 2).diagonal()
-    torch.testing.assert_close(covariance(problem, agreeing).diagonal(), independent)
+    torch.testing.assert_close(covariance(problem, agreeing).covariance.diagonal(), independent)
 
 
 def test_effect_of_a_shift_of_the_centre_is_the_shift() -> None:

@@ -8,9 +8,11 @@ import torch
 from evo.core.geometry import umeyama_alignment
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama
 from v3d_torch.geometry.se3 import se3_exp
 
@@ -67,6 +69,41 @@ def test_scale_of_points_at_one_place_is_one(count: int, weighted: bool) -> None
     torch.testing.assert_close(torch.linalg.det(T), torch.tensor(1.0, dtype=torch.float64))
     T.sum().backward()
     assert p.grad is not None and p.grad.isfinite().all()
+
+
+def test_scale_of_a_single_pair_is_one() -> None:
+    """The mean of one pair, and of several at one place, differs from them by rounding errors."""
+    p, q = 100 * normal(1000, 7, 3), normal(1000, 7, 3, seed=1)
+    weights = torch.rand(1000, 7, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    one = torch.tensor([0, 0, 1, 0, 0, 0, 0])
+    for points, each in ((p, one * weights), (p[:, :1].expand(-1, 7, -1), weights)):
+        T = umeyama(points, q, each, with_scale=True)
+        torch.testing.assert_close(torch.linalg.det(T), torch.ones(1000, dtype=torch.float64))
+
+
+def test_scale_of_points_near_each_other_and_far_from_the_origin() -> None:
+    p = 1e-6 * normal(7, 3) + torch.tensor([100.0, -20.0, 3.0])
+    T = umeyama(p, 2 * p, with_scale=True)
+    torch.testing.assert_close(T[:3, :3], 2 * torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("bad", [-0.1, torch.nan])
+def test_negative_weights_are_rejected(bad: float) -> None:
+    """The transform of points with negative weights has no smallest squared error."""
+    p, q, weights = normal(7, 3), normal(7, 3, seed=1), torch.ones(7)
+    weights[3] = bad
+    with pytest.raises(InputError, match="weights has a value that is negative or NaN"):
+        umeyama(p, q, weights)
+    valid = torch.arange(7) != 3
+    torch.testing.assert_close(umeyama(p, q, weights, valid), umeyama(p[valid], q[valid]))
+
+
+@pytest.mark.parametrize("name", ["weights", "valid"])
+@pytest.mark.parametrize("shape", [(7, 1), (6,), (1,)])
+def test_weights_of_another_shape_are_rejected(name: str, shape: tuple[int, ...]) -> None:
+    dtype = torch.bool if name == "valid" else torch.float64
+    with pytest.raises(ShapeError):
+        umeyama(normal(7, 3), normal(7, 3, seed=1), **{name: torch.ones(shape, dtype=dtype)})
 
 
 def test_fully_padded_row_with_scale_is_the_identity() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import kornia_rs
+import numpy as np
 import pytest
 import torch
 from helpers import camera_inputs
@@ -74,6 +75,28 @@ def test_any_input_can_have_batch_dimensions(name: str, count: int) -> None:
         assert torch.equal(match(**several), torch.stack(expected))
         nested = match(**several | {"a_valid": several["a_valid"].expand(2, 3, count)})
         assert torch.equal(nested, torch.stack(expected).expand(2, 3, count))
+
+
+def test_ratio_test_of_both_implementations_is_exact() -> None:
+    """Distances of 3 and 5 bits to 51 and 85 bits, with a maximum ratio that is theirs up to rounding."""
+    twin = TWINS["v3d_torch.features.matching.match_descriptors"]
+    for scale in range(1, 18):
+        a, b = torch.zeros(2, 32, dtype=torch.uint8), torch.zeros(2, 32, dtype=torch.uint8)
+        a[1] = 255
+        for row, bits in ((0, 3 * scale), (1, 5 * scale)):
+            b[row] = torch.from_numpy(np.packbits(np.arange(256) < bits))
+        for ratio in (3 / 5, np.nextafter(3 / 5, 0), np.nextafter(3 / 5, 1)):
+            expected = [0 if 3 * scale < ratio * (5 * scale) else -1, -1]
+            for match in twin if ENABLED else (twin.torch,):
+                assert match(a, b, max_hamming=256, max_ratio=float(ratio)).tolist() == expected
+
+
+def test_wide_descriptors_inside_autocast_match_as_outside() -> None:
+    """Scalar products above 256 are not exact in bfloat16."""
+    a = random_descriptors(120, 0).reshape(30, 128)
+    b = torch.cat([invert_bits(a, 21), invert_bits(a, 20)])
+    with torch.autocast("cpu", torch.bfloat16):
+        assert match_descriptors(a, b, max_hamming=64, max_ratio=0.99).tolist() == list(range(30, 60))
 
 
 @settings(max_examples=30)

@@ -125,6 +125,27 @@ def test_orthonormalise_returns_the_nearest_rotation() -> None:
     torch.testing.assert_close(stretch, stretch.mT, rtol=0, atol=1e-14)
 
 
+def test_orthonormalise_has_gradients() -> None:
+    """The singular vectors of rotations, whose singular values are equal, have none."""
+    T = se3_exp(tangents(2.0, 3))
+    changed = T.clone()
+    changed[:, :3, :3] += 0.1 * torch.sin(torch.arange(27, dtype=torch.float64)).reshape(3, 3, 3)
+    mirrored = changed.clone()
+    mirrored[:, :3, 0] *= -1
+    for each in (T, changed, mirrored):
+        assert torch.autograd.gradcheck(orthonormalise, each.requires_grad_())
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.int64])
+def test_orthonormalise_in_another_dtype(dtype: torch.dtype) -> None:
+    T = (se3_exp(tangents(2.0, 3)) if dtype.is_floating_point else torch.eye(4)).to(dtype)
+    found = orthonormalise(T)
+    assert found.dtype == (dtype if dtype.is_floating_point else torch.float32)
+    torch.testing.assert_close(found, orthonormalise(T.double()).to(found.dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(orthonormalise(T), found)
+
+
 def test_orthonormalised_chain_of_poses_stays_rigid() -> None:
     """Rounding errors do not grow when a pose is converted to a keyframe's frame and back many times."""
     keyframe, pose = se3_exp(tangents(1.0, 2))

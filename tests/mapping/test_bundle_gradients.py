@@ -21,7 +21,7 @@ OBSERVATIONS = 24
 
 
 def bundle(batch: int = 2) -> dict[str, Tensor]:
-    """Problems in which every seventh observation is padding and some lie where Huber's kernel is linear."""
+    """Problems in which every seventh observation is padding and some lie where Huber's loss is linear."""
     inputs = camera_inputs.bundle(batch, OBSERVATIONS, torch.float64)
     inputs["uv"][:, ::5] += 4.0
     return inputs | {"valid": torch.arange(OBSERVATIONS).expand(batch, -1) % 7 > 0}

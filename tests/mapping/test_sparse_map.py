@@ -159,6 +159,17 @@ def test_local_map_is_the_active_landmarks_of_the_most_covisible_keyframes(
     assert len(sparse_map.local_map(torch.zeros(0, dtype=torch.int64), 3).ids) == 0
 
 
+def test_local_map_has_the_landmarks_of_removed_observations(observed_sets: tuple[SparseMap, list[set[int]]]) -> None:
+    """They are in view of the keyframe, whose other landmarks make it covisible."""
+    sparse_map, sets = observed_sets
+    best = int(covisible_keyframes(sparse_map, torch.tensor([2, 9]), 1))
+    table = sparse_map.observations
+    outlier = min(sets[best] - {2, 9})
+    sparse_map.remove_observations(torch.nonzero((table["keyframe"] == best) & (table["landmark"] == outlier))[:, 0])
+    assert count_shared_landmarks(sparse_map, torch.tensor([outlier]))[best] == 0
+    assert sparse_map.local_map(torch.tensor([2, 9]), 1).ids.tolist() == sorted(sets[best])
+
+
 # --- edits
 
 

@@ -29,6 +29,7 @@ from helpers.rendered_planes import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
@@ -242,6 +243,28 @@ def test_pairs_of_a_batch_are_aligned_as_alone() -> None:
         for one, other in zip(found, alone, strict=True):
             assert torch.equal(one[k], other)
     assert align_depth(greys_a[:0], depths_a[:0], greys_b[:0], depths_b[:0], LENS).T_ba.shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize("name", ["T_ba", "static_a", "static_b"])
+def test_only_the_prediction_or_a_mask_can_have_batch_dimensions(name: str) -> None:
+    masks = ALL_PIXELS.repeat(2, 1, 1)
+    masks[0, :, :100] = False
+    several = torch.stack([MOTION, IDENTITY]) if name == "T_ba" else masks
+    config = DenseOdometryConfig(halvings=(4, 3, 2))
+    found = align_depth(*A, *B, LENS, **{name: several[:, None]}, config=config)
+    assert found.T_ba.shape == (2, 1, 4, 4) and found.reliable.all()
+    for k in range(2):
+        alone = align_depth(*A, *B, LENS, **{name: several[k]}, config=config)
+        for one, other in zip(found, alone, strict=True):
+            assert torch.equal(one[k, 0], other)
+
+
+@pytest.mark.parametrize("name", ["T_ba", "static_a", "static_b"])
+def test_predictions_and_masks_of_another_shape_are_rejected(name: str) -> None:
+    for shape in ((3, 3), (4,)) if name == "T_ba" else ((1, 1), (480, 1), (640,)):
+        given = torch.ones(shape, dtype=torch.float64 if name == "T_ba" else torch.bool)
+        with pytest.raises(ShapeError):
+            align_depth(*A, *B, LENS, **{name: given})
 
 
 def test_images_without_a_batch_dimension_are_aligned() -> None:

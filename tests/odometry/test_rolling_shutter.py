@@ -8,7 +8,9 @@ from functools import partial
 
 import pytest
 import torch
+from helpers import camera_inputs
 from helpers.rolling_camera import AT_REST, CAMERA, KINECT, VELOCITY, features_of, observe_rolling, points_in_view
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -85,6 +87,42 @@ def test_image_with_less_than_two_rows_is_rejected(height: int) -> None:
     uv, each = torch.zeros(3, 2, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
     with pytest.raises(ConfigError, match=f"^height is {height}; give at least 2 rows$"):
         compensate_rolling_shutter(uv, each, each, VELOCITY, 0.02, CAMERA.K, height, uv)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"),
+    [
+        ("uv", (4, 3)),
+        ("row", (3,)),
+        ("inverse_depth", (3,)),
+        ("inverse_depth", ()),
+        ("velocity", (3,)),
+        ("velocity", (7,)),
+        ("K", (2, 2)),
+        ("K", (3, 4)),
+        ("readout_jacobian", (3, 2)),
+        ("readout_jacobian", (4, 1)),
+        ("readout_jacobian", (4,)),
+        ("valid", (3,)),
+    ],
+)
+def test_arguments_of_another_shape_are_rejected(name: str, shape: tuple[int, ...]) -> None:
+    """The compiled function read memory behind a velocity of three numbers, and behind too few derivatives."""
+    dtype = torch.bool if name == "valid" else torch.float64
+    given = {key: each[0] for key, each in camera_inputs.rolling(1, 4, torch.float64).items() if key != "valid"}
+    with pytest.raises(ShapeError):
+        compensate_rolling_shutter(**given | {name: torch.ones(shape, dtype=dtype)}, readout=0.02, height=480)
+
+
+def test_readout_jacobian_can_have_another_dtype_or_more_dimensions() -> None:
+    given = {key: each[0] for key, each in camera_inputs.rolling(1, 4, torch.float64).items() if key != "valid"}
+    expected = compensate_rolling_shutter(**given, readout=0.02, height=480)
+    jacobian = given.pop("readout_jacobian")
+    single = compensate_rolling_shutter(**given, readout_jacobian=jacobian.float(), readout=0.02, height=480)
+    several = compensate_rolling_shutter(**given, readout_jacobian=jacobian.expand(3, 4, 2), readout=0.02, height=480)
+    for k in range(2):
+        torch.testing.assert_close(single[k], expected[k], rtol=1e-6, atol=1e-6)
+        torch.testing.assert_close(several[k], expected[k].expand(3, 4, 2))
 
 
 def test_readout_of_a_camera_is_certain_if_given_else_the_prior() -> None:

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.func import grad, vmap
 
-from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
+from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 
 
 def test_jacobian_of_rows_equals_autograd() -> None:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt and robust kernels: convergence, derivatives, agreement with SciPy."""
+"""Levenberg-Marquardt and robust losses: convergence, derivatives, agreement with SciPy."""
 
 from __future__ import annotations
 

@@ -269,7 +269,7 @@ def test_gradients_equal_finite_differences(rounds: int) -> None:
     """With respect to landmarks, pixels, intrinsics, depths, standard deviations, and weights."""
     inputs = clean_view()
     if rounds == 1:
-        inputs["uv"][:, ::4] += 6.0  # where Huber's kernel is linear
+        inputs["uv"][:, ::4] += 6.0  # where Huber's loss is linear
     measured = inputs["inverse_depth"] > 0
 
     def pose(points: Tensor, uv: Tensor, K: Tensor, depth: Tensor, sigmas: Tensor, weights: Tensor) -> Tensor:

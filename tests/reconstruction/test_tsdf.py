@@ -68,6 +68,15 @@ def test_blocks_cover_the_surface_and_its_truncation_band_only() -> None:
     assert len(far) == 0  # beyond max_depth
 
 
+def test_blocks_smaller_than_the_truncation_distance_are_covered_without_gaps() -> None:
+    """Only those at the surface and at both ends of the band were found, and the mesh had holes."""
+    config = DenseMapConfig(stride=1, mesh=MeshConfig(voxel_size=0.005, truncation=0.08))
+    blocks = surface_blocks(flat(2.01), config)
+    for column in ([0, 0], [-3, 5], [7, -2]):  # near the optical axis, where rays are nearly parallel to it
+        found = blocks[(blocks[:, :2] == torch.tensor(column)).all(dim=1)]
+        assert found[:, 2].tolist() == [48, 49, 50, 51, 52]  # of 4 cm, from 1.93 m to 2.09 m
+
+
 def test_convention_distances_are_along_the_optical_axis_and_positive_in_front_of_the_surface() -> None:
     blocks = torch.tensor([[0, 0, 12], [0, 0, 5], [0, 0, 14], [0, 0, -12]])
     distances, weights = integrate(blocks, flat(2.0), CONFIG)

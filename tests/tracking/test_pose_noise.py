@@ -25,7 +25,7 @@ def test_noise_of_a_smooth_motion_is_measured(factor: float) -> None:
     for n in range(300):
         error = factor * NOMINAL.sqrt() @ torch.randn(6, dtype=torch.float64, generator=generator)
         noise.update(n / 30, se3_exp(amplitude * torch.sin(torch.tensor(n / 15.0))) @ se3_exp(error), NOMINAL)
-    ratios = (noise.scale(NOMINAL) / NOMINAL).diagonal()
+    ratios = (noise.scale(NOMINAL, 1.0)[0] / NOMINAL).diagonal()
     assert 0.6 * factor**2 < ratios.min() and ratios.max() < 1.7 * factor**2
 
 
@@ -33,18 +33,20 @@ def test_camera_at_rest_has_at_least_the_nominal_noise() -> None:
     noise = PoseNoise()
     for n in range(500):
         noise.update(n / 30, torch.eye(4, dtype=torch.float64), NOMINAL)
-    torch.testing.assert_close(noise.scale(NOMINAL), NOMINAL)
-    torch.testing.assert_close(noise.scale(NOMINAL, variance=3.0), NOMINAL)  # the map has no more noise than its frames
+    for scaled in noise.scale(NOMINAL, 1.0, 3.0):  # the map has no more noise than its frames
+        torch.testing.assert_close(scaled, NOMINAL)
 
 
 def test_noise_of_the_map_multiplies_that_of_a_frame() -> None:
     noise = PoseNoise()  # the prior ratio is far above the minimum
-    torch.testing.assert_close(noise.scale(NOMINAL, variance=3.0), 3 * noise.scale(NOMINAL))
+    frame, whole = noise.scale(NOMINAL, 1.0, 3.0)
+    torch.testing.assert_close(whole, 3 * frame)
+    assert torch.equal(whole, noise.scale(NOMINAL, 3.0)[0]) and noise.scale(NOMINAL) == []
 
 
 def test_windows_over_interruptions_do_not_count() -> None:
     noise = PoseNoise()
-    before = noise.scale(NOMINAL)
+    before = noise.scale(NOMINAL, 1.0)[0]
     for n in range(40):
         if n % 4 == 0:
             noise.interrupt()
@@ -53,7 +55,7 @@ def test_windows_over_interruptions_do_not_count() -> None:
         noise.update(10.0 + n, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
     for n in range(40):  # five frames last for 0.4 s
         noise.update(100.0 + n / 10, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
-    assert torch.equal(noise.scale(NOMINAL), before)
+    assert torch.equal(noise.scale(NOMINAL, 1.0)[0], before)
 
 
 def test_error_of_the_map_grows_along_a_chain_of_keyframes() -> None:

@@ -101,19 +101,18 @@ class LoopCloser:
         """Restore a state of `state_dict`; call `rebuild_database` as well."""
         self.loop_count = state["loop_count"]
 
-    def relocalise(self, features: Features, sparse_map: SparseMap, exclude: Iterable[int] = ()) -> PlaceMatch | None:
+    def relocalise(self, features: Features, sparse_map: SparseMap) -> PlaceMatch | None:
         """Find the place in the map at which an image was taken.
 
         Args:
             features: Features of the image.
             sparse_map: Map to search.
-            exclude: Indices of keyframes that are not candidates.
 
         Returns:
             The first candidate that passes verification: a relative motion to its keyframe is found, and enough
             landmarks around the keyframe match. None if no candidate passes.
         """
-        return next(self._verified_places(features, sparse_map, exclude), None)
+        return next(self._verified_places(features, sparse_map, exclude=()), None)
 
     def detect_loop(self, keyframe: Keyframe, sparse_map: SparseMap, T_cw: Tensor) -> LoopCorrection | None:
         """Detect a loop that ends at a keyframe and optimise the pose graph with it; the map does not change.

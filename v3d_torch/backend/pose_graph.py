@@ -16,12 +16,13 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.optim.block_system import solve_block_system
-from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
@@ -98,7 +99,7 @@ def optimise_pose_graph(
         valid: Mask of the edges that are not padding, bool, shape :math:`(*, E)`; None for all.
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
-        robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
+        robust: Error, in standard deviations, above which Huber's loss grows linearly; None for plain least squares.
 
     Returns:
         The poses of minimal cost, with the dtype of ``T_wc``, float32 for integers; costs at least in float32.
@@ -116,6 +117,13 @@ def optimise_pose_graph(
     KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
     KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
+    if information is not None:
+        KORNIA_CHECK_SHAPE(information, ["*", str(measured.shape[-3]), "6", "6"])
+    if fixed is not None:
+        KORNIA_CHECK_SHAPE(fixed, ["*", str(initial.shape[-3])])
+    for column in (weights, valid):
+        if column is not None:
+            KORNIA_CHECK_SHAPE(column, ["*", str(measured.shape[-3])])
     graph, start = _prepare(initial, edges, measured, information, fixed, weights, valid, robust)
     with torch.no_grad():
         found = _minimise(start.detach(), *graph.detach(), iterations=iterations, tolerance=tolerance)
@@ -157,7 +165,7 @@ class _Graph(NamedTuple):
     information: Tensor  # (..., E, 6, 6)
     weights: Tensor  # (..., E)
     fixed: Tensor  # (..., N)
-    limit: Tensor  # (), squared error from which Huber's kernel is linear
+    limit: Tensor  # (), squared error from which Huber's loss is linear
 
     @property
     def is_fixed(self) -> Tensor:
@@ -296,7 +304,7 @@ class PoseGraphOptimiser(torch.nn.Module):
     Args:
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
-        robust: Error, in standard deviations, above which Huber's kernel grows linearly; None for plain least squares.
+        robust: Error, in standard deviations, above which Huber's loss grows linearly; None for plain least squares.
     """
 
     def __init__(self, iterations: int = 50, tolerance: float = 1e-6, robust: float | None = None) -> None:

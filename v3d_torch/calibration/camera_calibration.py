@@ -107,14 +107,15 @@ def _estimate_delay(
 ) -> Estimate:
     """Estimate the delay of depth from occlusion boundaries and edges of the colour images."""
     alignment = EdgeAlignment(views, trajectory, camera.depth_delay, max_views=_MAX_VIEWS)
-    value, sigma = math.nan, math.inf
+    value, sigma, blocks = math.nan, math.inf, 0
     if len(alignment) >= _MIN_VIEWS:
         starts = alignment.search(), torch.zeros(3, dtype=torch.float64)
         found = max(map(alignment.refine, starts), key=lambda each: alignment.total_score(each.values))
         # A larger shift means that the depth is not registered, or that other edges fit by chance.
         if float(found.values[:2].norm()) < _MAX_SHIFT * camera.width:
             value, sigma = camera.depth_delay + float(found.values[2]), float(found.sigma[2])
-    return decide("depth_delay", given.depth_delay, value, sigma, _DELAY_TOLERANCE)
+            blocks = found.blocks
+    return decide("depth_delay", given.depth_delay, value, sigma, blocks, _DELAY_TOLERANCE)
 
 
 def _estimate_scale(
@@ -124,7 +125,7 @@ def _estimate_scale(
     if camera.depth_scale is None or given.depth_scale is None:
         return []
     measured = None if groundtruth is None else metric_scale(groundtruth, trajectory)
-    ratio, sigma = (math.nan, math.inf) if measured is None else measured
+    ratio, sigma, blocks = (math.nan, math.inf, 0) if measured is None else measured
     value = camera.depth_scale / ratio
     tolerance = _SCALE_TOLERANCE * given.depth_scale
-    return [decide("depth_scale", given.depth_scale, value, value * sigma / ratio, tolerance)]
+    return [decide("depth_scale", given.depth_scale, value, value * sigma / ratio, blocks, tolerance)]

@@ -70,10 +70,12 @@ class Misalignment:
         values: Shift of the colour image relative to the depth image along u and v (frame pixels), and delay of the
             depth image in addition to the assumed delay (seconds), float64, shape :math:`(3,)`.
         covariance: Covariance of the values, by the jackknife over views, shape :math:`(3, 3)`.
+        blocks: Number of blocks of the jackknife.
     """
 
     values: Tensor
     covariance: Tensor
+    blocks: int
 
     @property
     def sigma(self) -> Tensor:
@@ -180,9 +182,10 @@ class EdgeAlignment:
                 break
             values, score = moved, new
             gradient, hessian = self._derivatives(values, index)
+        jackknife = jackknife_covariance(-gradient, -hessian)
         covariance, units = torch.zeros(3, 3, dtype=torch.float64), self._steps[index]
-        covariance[index[:, None], index] = jackknife_covariance(-gradient, -hessian) * units[:, None] * units
-        return Misalignment(values, covariance)
+        covariance[index[:, None], index] = jackknife.covariance * units[:, None] * units
+        return Misalignment(values, covariance, jackknife.blocks)
 
     def total_score(self, values: Tensor) -> float:
         """Sum of the normalised gradients at all boundaries, moved by a shift and a delay as in `Misalignment`."""

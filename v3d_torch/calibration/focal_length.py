@@ -63,7 +63,7 @@ def better_focal_lengths(tables: MapTables, camera: PinholeCamera, config: Confi
     if not minima:
         return None
     values, at = min(minima, key=lambda found: float(problem.adjust(names, found[0], *found[1][:2]).cost))
-    sigma = covariance(problem, at).diagonal().clamp(min=0).sqrt()
+    sigma = covariance(problem, at).covariance.diagonal().clamp(min=0).sqrt()
     change = (values / given).log().abs()
     needed = (_MODEL_ERROR + _SIGNIFICANCE * sigma / values).clamp(min=_MIN_CHANGE)
     if not bool((change > needed)[:2].any()):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 
 from v3d_torch.evaluation.association import associate_trajectories
@@ -13,7 +15,21 @@ _MIN_PAIRS = 10
 """Minimum number of pairs of poses."""
 
 
-def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, float] | None:
+class MetricScale(NamedTuple):
+    """Scale of a measured trajectory relative to an estimated trajectory.
+
+    Attributes:
+        ratio: Ratio of the sizes.
+        sigma: Its standard deviation, by the jackknife over blocks of time.
+        blocks: Number of these blocks.
+    """
+
+    ratio: float
+    sigma: float
+    blocks: int
+
+
+def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> MetricScale | None:
     """Scale of a measured trajectory relative to an estimated trajectory.
 
     It is the inverse of the factor by which the measured positions fit the estimated ones best. Measured positions are
@@ -25,8 +41,8 @@ def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, 
         estimate: Estimated poses, in the metres of the depth images.
 
     Returns:
-        Ratio and its standard deviation, by the jackknife over blocks of time; None if the trajectories have too few
-        common poses, if the positions of one do not span a plane, or if the positions are not correlated.
+        Ratio and its standard deviation; None if the trajectories have too few common poses, if the positions of one do
+        not span a plane, or if the positions are not correlated.
     """
     matches = associate_trajectories(groundtruth, estimate)
     if len(matches) < _MIN_PAIRS:
@@ -41,5 +57,5 @@ def metric_scale(groundtruth: Trajectory, estimate: Trajectory) -> tuple[float, 
     if factor <= 0:
         return None
     gradient = -2 * (measured * (estimated - factor * measured)).sum(dim=1)
-    variance = jackknife_covariance(gradient[:, None], 2 * squared[:, None, None])
-    return 1 / factor, float(torch.sqrt(variance[0, 0])) / factor**2
+    variance, blocks = jackknife_covariance(gradient[:, None], 2 * squared[:, None, None])
+    return MetricScale(1 / factor, float(torch.sqrt(variance[0, 0])) / factor**2, blocks)

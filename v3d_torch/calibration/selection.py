@@ -23,7 +23,7 @@ from v3d_torch.calibration.parameters import (
 )
 from v3d_torch.calibration.problem import AdjustedMap, SelfCalibration
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.optim.jackknife import MAX_BLOCKS, jackknife_covariance, p_value
+from v3d_torch.optim.jackknife import MAX_BLOCKS, Jackknife, jackknife_covariance, p_value
 
 MAX_P_VALUE = 1e-3
 """Significance level: maximum probability of a difference by chance with which an estimate is accepted."""
@@ -68,21 +68,22 @@ NOT_DETERMINED, AGREES = "not determined by the recording", "agrees with the giv
 """Reasons why given values are kept."""
 
 
-def decide(name: str, given: float, value: float, sigma: float, tolerance: float) -> Estimate:
+def decide(name: str, given: float, value: float, sigma: float, blocks: int, tolerance: float) -> Estimate:
     """Decide whether the estimate of a single parameter replaces the given value.
 
     Args:
         name: Name of the parameter.
         given: Given value.
         value: Estimated value.
-        sigma: Standard deviation of the estimate.
+        sigma: Standard deviation of the estimate, by the jackknife.
+        blocks: Number of its blocks.
         tolerance: Maximum accepted standard deviation.
     """
     if not sigma <= tolerance:
         return Estimate(name, given, value, sigma, accepted=False, reason=NOT_DETERMINED)
     difference = torch.tensor([value - given], dtype=torch.float64)
     variance = torch.tensor([[sigma**2]], dtype=torch.float64)
-    if p_value(difference, variance, torch.zeros_like(variance)) > MAX_P_VALUE:
+    if p_value(difference, variance, torch.zeros_like(variance), blocks) > MAX_P_VALUE:
         return Estimate(name, given, value, sigma, accepted=False, reason=AGREES)
     return Estimate(name, given, value, sigma, accepted=True, reason="")
 
@@ -94,11 +95,13 @@ class _Fit:
     Attributes:
         values: Value of each free parameter.
         covariance: Covariance of the free parameters, shape (C, C).
+        blocks: Number of blocks of keyframes from which it comes.
         width: Width of the images, pixels.
     """
 
     values: dict[str, float]
     covariance: Tensor
+    blocks: int
     width: int
 
     def sigma(self, name: str) -> float:
@@ -175,11 +178,11 @@ class ParameterSelection:
     def _fit(self, groups: Sequence[ParameterGroup]) -> _Fit:
         names, width = [name for group in groups for name in group.parameters], self._problem.given.width
         if not names:
-            return _Fit({}, torch.zeros(0, 0, dtype=torch.float64), width)
+            return _Fit({}, torch.zeros(0, 0, dtype=torch.float64), 0, width)
         given = self._problem.given_values(names).tolist()
         start = [self.fit.values.get(name, value) for name, value in zip(names, given, strict=True)]
         values, at = self._problem.minimise(names, torch.tensor(start, dtype=torch.float64))
-        return _Fit(dict(zip(names, values.tolist(), strict=True)), covariance(self._problem, at), width)
+        return _Fit(dict(zip(names, values.tolist(), strict=True)), *covariance(self._problem, at), width)
 
     def _is_determined(self, group: ParameterGroup, fit: _Fit) -> bool:
         """Check whether a fit determines a group within its tolerance."""
@@ -207,7 +210,7 @@ class ParameterSelection:
         found = torch.tensor([self.fit.values[name] for name in names], dtype=torch.float64)
         difference = found - self._problem.given_values(names)
         model_error = torch.tensor([self.fit.model_error(name) for name in names], dtype=torch.float64)
-        return p_value(difference, self.fit.covariance_of(group), model_error.square().diag())
+        return p_value(difference, self.fit.covariance_of(group), model_error.square().diag(), self.fit.blocks)
 
     def _reject(self, group: ParameterGroup, fit: _Fit, reason: str) -> None:
         for name in group.parameters:
@@ -218,7 +221,7 @@ class ParameterSelection:
             )
 
 
-def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
+def covariance(problem: SelfCalibration, at: AdjustedMap) -> Jackknife:
     """Covariance of the free parameters at the minimum.
 
     It is the jackknife covariance over blocks of keyframes, corrected for the degrees of freedom of poses and points.
@@ -231,19 +234,18 @@ def covariance(problem: SelfCalibration, at: AdjustedMap) -> Tensor:
         at: Map adjusted for the minimum.
 
     Returns:
-        Shape :math:`(C, C)`.
+        The covariance, shape :math:`(C, C)`, and the number of the shorter blocks.
     """
     freedom = problem.residual_count / max(problem.residual_count - problem.unknown_count, 1)
-    jackknife, longer = (
-        freedom * jackknife_covariance(at.gradient, at.hessian, blocks) for blocks in (MAX_BLOCKS, _LONG_BLOCKS)
-    )
-    if not jackknife.isfinite().all():
-        return jackknife
+    found, longer = (jackknife_covariance(at.gradient, at.hessian, blocks) for blocks in (MAX_BLOCKS, _LONG_BLOCKS))
+    if not found.covariance.isfinite().all():
+        return found
+    jackknife = freedom * found.covariance
     variances = [torch.linalg.inv(at.hessian.sum(dim=0) / 2).diagonal(), jackknife.diagonal()]
-    if longer.isfinite().all():
-        variances.append(longer.diagonal())
+    if longer.covariance.isfinite().all():
+        variances.append(freedom * longer.covariance.diagonal())
     growth = (torch.stack(variances).amax(dim=0) / jackknife.diagonal()).sqrt()
-    return growth[:, None] * jackknife * growth
+    return Jackknife(growth[:, None] * jackknife * growth, found.blocks)
 
 
 def pixel_effect(camera: PinholeCamera, names: Sequence[str], covariance: Tensor) -> float:

@@ -10,9 +10,12 @@ from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
-from v3d_torch.geometry.se3 import se3_exp, to_matrix
-from v3d_torch.optim.implicit import needs_gradient, zero_with_gradient
-from v3d_torch.runtime.batches import fill_padding
+from v3d_torch.geometry.se3 import differentiable_rotation, to_matrix
+from v3d_torch.runtime.batches import check_weights, fill_padding, mask_or_all
+
+_SAME_PLACE = 1e-12
+"""Largest distance of points at one place from their mean, as a fraction of their distance from the origin. Rounding of
+the mean causes a fraction of some 1e-15."""
 
 
 def umeyama(
@@ -46,11 +49,16 @@ def umeyama(
         scale, which is then 1. It is NaN if a point is not finite.
 
     Raises:
-        InputError: If ``valid`` is not bool.
+        InputError: If ``valid`` is not bool, or if a weight is negative or NaN.
     """
     check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
+    for column in (weights, valid):
+        if column is not None:
+            KORNIA_CHECK_SHAPE(column, ["*", str(p.shape[-2])])
+    if weights is not None:
+        check_weights(weights, mask_or_all(valid, weights))
     each = None if valid is None else valid[..., None]
     a, b = fill_padding(p, each, 0.0), fill_padding(q, each, 0.0)
     if weights is None:
@@ -58,13 +66,15 @@ def umeyama(
     else:
         w = fill_padding(weights, valid, 0.0)[..., None]
     mean_a, mean_b = (weighted_mean(points, w) for points in (a, b))
+    size = _sum_of_squares(a, w) if with_scale else None
     a, b = a - mean_a[..., None, :], b - mean_b[..., None, :]
     M = sum_products(b if w is None else b * w, a)
     R = nearest_rotation(M)
-    if with_scale:
-        spread = (a.square() if w is None else a.square() * w).sum(dim=(-2, -1))
-        scale = (R * M).sum(dim=(-2, -1)) / torch.where(spread > 0, spread, 1.0)
-        R = R * torch.where(spread > 0, scale, 1.0)[..., None, None]
+    if size is not None:
+        spread = _sum_of_squares(a, w)
+        is_spread = spread > _SAME_PLACE**2 * size
+        scale = (R * M).sum(dim=(-2, -1)) / torch.where(is_spread, spread, 1.0)
+        R = R * torch.where(is_spread, scale, 1.0)[..., None, None]
     return to_matrix(R, mean_b - (R @ mean_a[..., None])[..., 0]).to(result_dtype(p.dtype))
 
 
@@ -84,6 +94,11 @@ def weighted_mean(points: Tensor, weights: Tensor | None) -> Tensor:
     return (weights * points).sum(dim=-2) / torch.where(total > 0, total, 1.0)
 
 
+def _sum_of_squares(points: Tensor, weights: Tensor | None) -> Tensor:
+    """Weighted sum of the squared distances of points (..., N, 3) from the origin, (...)."""
+    return (points.square() if weights is None else points.square() * weights).sum(dim=(-2, -1))
+
+
 def nearest_rotation(M: Tensor) -> Tensor:
     """Rotation R that maximises trace(R^T M), for matrices of shape (..., 3, 3); NaN if they are not finite.
 
@@ -93,13 +108,4 @@ def nearest_rotation(M: Tensor) -> Tensor:
     U, _, Vh = torch.linalg.svd(finite)
     signs = torch.stack([*torch.ones_like(finite[..., :2, 0]).unbind(-1), torch.linalg.det(U @ Vh).sign()], dim=-1)
     R = torch.where(is_unknown, torch.nan, (U * signs[..., None, :]) @ Vh)  # the last sign excludes reflections
-    if not needs_gradient(M):
-        return R
-    # Gradient and negated Hessian of trace(exp(phi)^T A) by phi, with A = M R^T.
-    A = M @ R.mT
-    gradient = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
-    fixed = ((A + A.mT) / 2).detach()
-    H = fixed.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] * torch.eye(3, dtype=A.dtype, device=A.device)
-    phi = (torch.linalg.pinv(zero_if_not_finite(H - fixed)[0], hermitian=True) @ gradient[..., None])[..., 0]
-    turn = torch.cat([torch.zeros_like(phi), zero_with_gradient(phi)], dim=-1)
-    return se3_exp(turn)[..., :3, :3] @ R
+    return differentiable_rotation(R, M)

@@ -18,9 +18,9 @@ from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather
 from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
 from v3d_torch.features.usac import usac_options
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
-from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, mask_or_all
 
 _MIN_PAIRS = 6

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from v3d_torch.config import OdometryConfig
 from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.kernels import descriptors as descriptor_kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.runtime.batches import common_batch
@@ -123,11 +124,14 @@ def match_descriptors(
     second = distance.scatter(-1, nearest[..., None], never).amin(dim=-1)
     row = torch.arange(a.shape[-2], device=a.device)
     mutual = distance.argmin(dim=-2).gather(-1, nearest) == row
+    # A distance of exactly the maximum ratio is compared as by the kernel: in float32, the limit is rounded.
+    is_distinct = best.to(torch.float64) < max_ratio * second.to(torch.float64)
     # Padding is never nearest, however large the thresholds are.
-    accepted = mutual & (best < never) & (best <= max_hamming) & (best < max_ratio * second) & enough[..., None]
+    accepted = mutual & (best < never) & (best <= max_hamming) & is_distinct & enough[..., None]
     return torch.where(accepted, nearest, -1)
 
 
+@without_autocast
 def _pairwise_hamming_distances(a: Tensor, b: Tensor) -> Tensor:
     """Hamming distances of all pairs of descriptors (..., N, D) and (..., M, D), float32, (..., N, M).
 

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from v3d_torch.geometry.gradients import zero_with_gradient
 from v3d_torch.geometry.se3 import hat, se3_exp
 from v3d_torch.kernels import sampson as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
-from v3d_torch.optim.implicit import jacobian, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, levenberg_marquardt, select
 from v3d_torch.runtime.batches import to_rows
 
@@ -93,11 +94,11 @@ class EpipolarProblem(NamedTuple):
         stretch = (line_a * change_a)[..., :2, :].sum(dim=-2) + (line_b * change_b)[..., :2, :].sum(dim=-2)
         return (change_b * b).sum(dim=-2) / length - distance * stretch / length.square()
 
-    def linearise(self, state: State, influence: Tensor) -> tuple[Tensor, State]:
+    def linearise(self, state: State, weights: Tensor) -> tuple[Tensor, State]:
         """Return the cost, half of its Gauss-Newton Hessian, and half of its gradient."""
         r, J = self.sampson(compose(*state)), self.jacobian(state)
-        weighted = J * influence[..., None, :]
-        return (influence * r.square()).sum(dim=-1), (weighted @ J.mT, (weighted @ r[..., None])[..., 0])
+        weighted = J * weights[..., None, :]
+        return (weights * r.square()).sum(dim=-1), (weighted @ J.mT, (weighted @ r[..., None])[..., 0])
 
     def differentiate(self, state: State, active: Tensor) -> State:
         """Return the optimum ``state`` of the active pairs with its derivatives attached."""
@@ -148,7 +149,7 @@ def _minimise(
     finished = torch.zeros(U.shape[:-2], dtype=torch.bool, device=U.device)
     for _ in range(_ROUNDS):
         active = select(finished, active, inliers)
-        linearise = partial(problem.linearise, influence=weights * active)
+        linearise = partial(problem.linearise, weights=weights * active)
         state = levenberg_marquardt(state, linearise, _step, _ITERATIONS, _TOLERANCE, finished).state
         inliers = valid & (problem.sampson(compose(*state)).abs() <= threshold)
         finished = finished | (inliers == active).all(dim=-1)

@@ -14,6 +14,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
+from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.kernels import se3 as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -89,6 +90,7 @@ def _orthonormalise_compiled(T: Tensor) -> Tensor:
 
 
 @compiled_by(_orthonormalise_compiled)
+@without_autocast
 def orthonormalise(T: Tensor) -> Tensor:
     """Replace rotations by the nearest orthonormal matrices.
 
@@ -99,11 +101,41 @@ def orthonormalise(T: Tensor) -> Tensor:
         T: Rigid motions with rounding errors, shape :math:`(..., 4, 4)`.
 
     Returns:
-        Rigid motions, shape :math:`(..., 4, 4)`, with (0, 0, 0, 1) as last row; NaN for rotations that are not finite.
+        Rigid motions, dtype of ``T``, float32 for integers, shape :math:`(..., 4, 4)`, with (0, 0, 0, 1) as last row;
+        NaN for rotations that are not finite.
     """
-    M, is_unknown = zero_if_not_finite(T[..., :3, :3])
-    U, _, Vh = torch.linalg.svd(M)
-    return to_matrix(torch.where(is_unknown, torch.nan, U @ Vh), T[..., :3, 3])
+    dtype, T = result_dtype(T.dtype), T.to(working_dtype(T.dtype))
+    M = T[..., :3, :3]
+    finite, is_unknown = zero_if_not_finite(M.detach())
+    U, _, Vh = torch.linalg.svd(finite)
+    R = differentiable_rotation(torch.where(is_unknown, torch.nan, U @ Vh), M)
+    return to_matrix(R, T[..., :3, 3]).to(dtype)
+
+
+def differentiable_rotation(R: Tensor, M: Tensor) -> Tensor:
+    """Return the rotations that are nearest to matrices with their derivatives by these matrices.
+
+    The derivatives are computed from the maximum of trace(R^T M) by the implicit function theorem, so that they are
+    finite even where singular vectors have none: a rotation has three equal singular values.
+
+    Args:
+        R: Rotations without derivatives that maximise trace(R^T M), shape :math:`(..., 3, 3)`; NaN where ``M`` is not
+            finite.
+        M: Matrices, shape :math:`(..., 3, 3)`.
+
+    Returns:
+        The same rotations, shape :math:`(..., 3, 3)`.
+    """
+    if not needs_gradient(M):
+        return R
+    # Gradient and negated Hessian of trace(exp(phi)^T A) by phi, with A = M R^T.
+    A = M @ R.mT
+    gradient = torch.stack([A[..., i, j] - A[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))], dim=-1)
+    fixed = ((A + A.mT) / 2).detach()
+    H = fixed.diagonal(dim1=-2, dim2=-1).sum(dim=-1)[..., None, None] * torch.eye(3, dtype=A.dtype, device=A.device)
+    phi = (torch.linalg.pinv(zero_if_not_finite(H - fixed)[0], hermitian=True) @ gradient[..., None])[..., 0]
+    turn = torch.cat([torch.zeros_like(phi), zero_with_gradient(phi)], dim=-1)
+    return se3_exp(turn)[..., :3, :3] @ R
 
 
 def are_rigid(T: Tensor, tolerance: float) -> Tensor:

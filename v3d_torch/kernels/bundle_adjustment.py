@@ -13,10 +13,10 @@ from v3d_torch.kernels.schur import solve_normal_equations
 
 @device
 def _compute_residuals(
-    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, influence: Floats, pose: Ints,
-    first: Ints, min_depth: float, r: Floats, weights: Floats, chi2: Floats,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, pose: Ints,
+    first: Ints, min_depth: float, r: Floats, robust_weights: Floats, chi2: Floats,
 ) -> float:  # fmt: skip
-    """Return the robust cost; write the whitened residuals, their weights, and the squared errors."""
+    """Return the robust cost; write whitened residuals, given weights times those of the loss, and squared errors."""
     cost = 0.0
     for p in range(len(points)):
         for m in range(first[p], first[p + 1]):
@@ -26,8 +26,8 @@ def _compute_residuals(
             r2 = scale[2, m] * w + offset[2, m]
             squared = r0 * r0 + r1 * r1 + r2 * r2
             robust, weight = huber(squared, thresholds[m])
-            cost += influence[m] * robust
-            weights[m] = influence[m] * weight
+            cost += weights[m] * robust
+            robust_weights[m] = weights[m] * weight
             r[m, 0], r[m, 1], r[m, 2], chi2[m] = r0, r1, r2, squared if z > min_depth else np.inf
     return cost
 
@@ -35,14 +35,14 @@ def _compute_residuals(
 @device
 def _linearise(
     T_cw: Floats, points: Floats, scale: Floats, pose: Ints, first: Ints, row: Ints, min_depth: float,
-    r: Floats, weights: Floats, U: Floats, V: Floats, W: Floats,
+    r: Floats, robust_weights: Floats, U: Floats, V: Floats, W: Floats,
 ) -> None:  # fmt: skip
     """Write the blocks of the normal equations; the last columns of U and V are gradients, W is for free poses only."""
     U[:], V[:] = 0.0, 0.0
     J = np.empty((3, 10))  # derivatives of a residual by pose and by point, and the residual
     for p in range(len(points)):
         for m in range(first[p], first[p + 1]):
-            T = T_cw[pose[m]]
+            T, weight = T_cw[pose[m]], robust_weights[m]
             x, y, z = transform(T, points[p, 0], points[p, 1], points[p, 2])
             w = 1 / max(z, min_depth)
             perspective_jacobian(x * w, y * w, w, J)
@@ -53,7 +53,7 @@ def _linearise(
                     J[i, 6 + k] = J[i, 0] * T[0, k] + J[i, 1] * T[1, k] + J[i, 2] * T[2, k]
                 J[i, 9] = r[m, i]
             for k in range(3):
-                j0, j1, j2 = weights[m] * J[0, 6 + k], weights[m] * J[1, 6 + k], weights[m] * J[2, 6 + k]
+                j0, j1, j2 = weight * J[0, 6 + k], weight * J[1, 6 + k], weight * J[2, 6 + k]
                 for i in range(4):
                     V[p, k, i] += j0 * J[0, 6 + i] + j1 * J[1, 6 + i] + j2 * J[2, 6 + i]
                 for i in range(6 if row[m] >= 0 else 0):
@@ -61,7 +61,7 @@ def _linearise(
             if row[m] < 0:
                 continue
             for k in range(6):
-                j0, j1, j2 = weights[m] * J[0, k], weights[m] * J[1, k], weights[m] * J[2, k]
+                j0, j1, j2 = weight * J[0, k], weight * J[1, k], weight * J[2, k]
                 for i in range(6):
                     U[row[m], k, i] += j0 * J[0, i] + j1 * J[1, i] + j2 * J[2, i]
                 U[row[m], k, 6] += j0 * J[0, 9] + j1 * J[1, 9] + j2 * J[2, 9]
@@ -80,7 +80,7 @@ def _find_rows(pose: Ints, free: Ints, count: int) -> Ints:
     " UniTuple(f8, 4))"
 )
 def bundle_adjust(
-    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, influence: Floats, pose: Ints,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, pose: Ints,
     first: Ints, free: Ints, iterations: int, tolerance: float, regularisation: float, min_depth: float,
     damping_schedule: DampingSchedule,
 ) -> tuple[Floats, Floats, Floats, float, float, int]:  # fmt: skip
@@ -91,8 +91,8 @@ def bundle_adjust(
         points: Initial points, world frame, (P, 3).
         scale: Scale of the whitened residuals, (3, M).
         offset: Offset of the whitened residuals, (3, M).
-        chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
-        influence: Given weight of each observation, (M,).
+        thresholds: Squared residual at which Huber's loss turns linear, (M,).
+        weights: Given weight of each observation, (M,).
         pose: Pose of each observation, sorted by point, (M,).
         first: First observation of each point, and M, (P + 1,).
         free: Indices of the poses that move, (F,).
@@ -107,21 +107,21 @@ def bundle_adjust(
     """
     F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
     U, V, W = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((M, 3, 6))
-    r, weights, chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
-    new_r, new_weights, new_chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
+    r, robust_weights, chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
+    new_r, new_robust_weights, new_chi2 = np.empty((M, 3)), np.empty(M), np.empty(M)
     cost = _compute_residuals(
-        T_cw, points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, r, weights, chi2
+        T_cw, points, scale, offset, thresholds, weights, pose, first, min_depth, r, robust_weights, chi2
     )
     damping, cost_before, iteration, converged, is_linearised = damping_schedule[0], cost, 0, False, False
     while iteration < iterations and not converged:
         if not is_linearised:
-            _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
+            _linearise(T_cw, points, scale, pose, first, row, min_depth, r, robust_weights, U, V, W)
         xi, delta = solve_normal_equations(U, V, W, row, first, damping, regularisation)
         new_T, new_points = T_cw.copy(), points + delta
         for f in range(F):
             new_T[free[f]] = multiply(se3_exp(xi[f]), T_cw[free[f]])
         new_cost = _compute_residuals(
-            new_T, new_points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, new_r, new_weights,
+            new_T, new_points, scale, offset, thresholds, weights, pose, first, min_depth, new_r, new_robust_weights,
             new_chi2,
         )  # fmt: skip
         iteration += 1
@@ -130,7 +130,8 @@ def bundle_adjust(
         is_linearised = not new_cost < cost
         if not is_linearised:
             T_cw, points, cost = new_T, new_points, new_cost
-            r, new_r, weights, new_weights, chi2, new_chi2 = new_r, r, new_weights, weights, new_chi2, chi2
+            r, new_r, chi2, new_chi2 = new_r, r, new_chi2, chi2
+            robust_weights, new_robust_weights = new_robust_weights, robust_weights
     return T_cw, points, chi2, cost_before, cost, iteration
 
 
@@ -138,7 +139,7 @@ def bundle_adjust(
     "(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:,::1], f8, f8, f8)"
 )
 def reduced_cost_derivatives(
-    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, influence: Floats, pose: Ints,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, pose: Ints,
     first: Ints, free: Ints, j: Floats, damping: float, regularisation: float, min_depth: float,
 ) -> tuple[float, float]:  # fmt: skip
     """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
@@ -148,8 +149,8 @@ def reduced_cost_derivatives(
         points: Points at the minimum, world frame, (P, 3).
         scale: Scale of the whitened residuals, (3, M).
         offset: Offset of the whitened residuals, (3, M).
-        chi2_thresholds: Squared residual at which the robust kernel turns linear, (M,).
-        influence: Given weight of each observation, (M,).
+        thresholds: Squared residual at which Huber's loss turns linear, (M,).
+        weights: Given weight of each observation, (M,).
         pose: Pose of each observation, sorted by point, (M,).
         first: First observation of each point, and M, (P + 1,).
         free: Indices of the poses that move, (F,).
@@ -162,18 +163,18 @@ def reduced_cost_derivatives(
         First and second derivative.
     """
     F, P, M, row = len(free), len(points), len(pose), _find_rows(pose, free, len(T_cw))
-    r, weights, chi2, W = np.empty((M, 3)), np.empty(M), np.empty(M), np.empty((M, 3, 6))
+    r, robust_weights, chi2, W = np.empty((M, 3)), np.empty(M), np.empty(M), np.empty((M, 3, 6))
     U, V, j_U, j_V = np.empty((F, 6, 7)), np.empty((P, 3, 4)), np.empty((F, 6, 7)), np.empty((P, 3, 4))
     _compute_residuals(
-        T_cw, points, scale, offset, chi2_thresholds, influence, pose, first, min_depth, r, weights, chi2
+        T_cw, points, scale, offset, thresholds, weights, pose, first, min_depth, r, robust_weights, chi2
     )
-    _linearise(T_cw, points, scale, pose, first, row, min_depth, r, weights, U, V, W)
-    _linearise(T_cw, points, scale, pose, first, row, min_depth, j, weights, j_U, j_V, W)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, r, robust_weights, U, V, W)
+    _linearise(T_cw, points, scale, pose, first, row, min_depth, j, robust_weights, j_U, j_V, W)
     xi, delta = solve_normal_equations(j_U, j_V, W, row, first, damping, regularisation)
     slope = (xi * U[:, :, 6]).sum() + (delta * V[:, :, 3]).sum()
     curvature = (xi * j_U[:, :, 6]).sum() + (delta * j_V[:, :, 3]).sum()
     for m in range(M):
         for i in range(3):
-            slope += weights[m] * j[m, i] * r[m, i]
-            curvature += weights[m] * j[m, i] * j[m, i]
+            slope += robust_weights[m] * j[m, i] * r[m, i]
+            curvature += robust_weights[m] * j[m, i] * j[m, i]
     return 2 * slope, 2 * curvature

@@ -64,7 +64,7 @@ def optimise_pose_graph(
         information: Inverse covariances of the errors, (E, 6, 6).
         weights: Weight of each edge, (E,).
         fixed: Mask of the fixed poses, (N,).
-        limit: Squared error from which Huber's kernel is linear.
+        limit: Squared error from which Huber's loss is linear.
         iterations: Maximum number of steps.
         tolerance: Relative change of the cost at convergence.
         regularisation: Added to the diagonal of the normal equations.

@@ -12,7 +12,7 @@ from v3d_torch.kernels.reprojection import huber, multiply, perspective_jacobian
 
 @device
 def _linearise(
-    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, influence: Floats, active: Bools,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, active: Bools,
     min_depth: float, H: Floats, g: Floats, chi2: Floats,
 ) -> float:  # fmt: skip
     """Return the robust cost of the active measurements; write the normal equations and all squared errors."""
@@ -28,8 +28,8 @@ def _linearise(
         if not active[i]:
             continue
         robust, weight = huber(squared, thresholds[i])
-        cost += influence[i] * robust
-        weight *= influence[i]
+        cost += weights[i] * robust
+        weight *= weights[i]
         perspective_jacobian(a, b, w, J)
         for k in range(6):
             j0, j1, j2 = scale[0, i] * J[0, k], scale[1, i] * J[1, k], scale[2, i] * J[2, k]
@@ -45,21 +45,21 @@ def _linearise(
 
 @device
 def _refine(
-    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, weights: Floats, valid: Bools,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, valid: Bools,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
     damping_schedule: DampingSchedule, inliers: Bools, active: Bools,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
     """Refine one pose; write the masks, and return pose, squared residuals and information matrix."""
     count = len(points)
-    inliers[:], active[:], thresholds = valid, valid, chi2_thresholds.copy()
+    inliers[:], active[:], loss_thresholds = valid, valid, thresholds.copy()
     H, g, chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
     new_H, new_g, new_chi2 = np.empty((6, 6)), np.empty(6), np.empty(count)
     for index in range(rounds):
         robust = 2 * index < rounds
         if not robust:
-            thresholds[:] = np.inf
+            loss_thresholds[:] = np.inf
         active[:] = inliers
-        cost = _linearise(T_cw, points, scale, offset, thresholds, weights, active, min_depth, H, g, chi2)
+        cost = _linearise(T_cw, points, scale, offset, loss_thresholds, weights, active, min_depth, H, g, chi2)
         damping, converged, iteration = damping_schedule[0], False, 0
         while iteration < iterations and not converged:
             damped = H.copy()
@@ -67,7 +67,7 @@ def _refine(
                 damped[k, k] = damped[k, k] * (1 + damping) + regularisation
             candidate = multiply(se3_exp(-solve_symmetric(damped, g)), T_cw)
             new_cost = _linearise(
-                candidate, points, scale, offset, thresholds, weights, active, min_depth, new_H, new_g, new_chi2
+                candidate, points, scale, offset, loss_thresholds, weights, active, min_depth, new_H, new_g, new_chi2
             )
             iteration += 1
             converged = has_converged(cost, new_cost, damping, tolerance)
@@ -77,7 +77,7 @@ def _refine(
                 H, new_H, g, new_g, chi2, new_chi2 = new_H, H, new_g, g, new_chi2, chi2
         unchanged = True
         for i in range(count):
-            is_inlier = valid[i] and chi2[i] <= chi2_thresholds[i]
+            is_inlier = valid[i] and chi2[i] <= thresholds[i]
             unchanged &= is_inlier == inliers[i]
             inliers[i] = is_inlier
         if not robust and unchanged:
@@ -93,7 +93,7 @@ def _refine(
     " UniTuple(f8, 4))"
 )
 def refine_poses(
-    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, chi2_thresholds: Floats, weights: Floats, valid: Bools,
+    T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, valid: Bools,
     rounds: int, iterations: int, tolerance: float, regularisation: float, min_depth: float,
     damping_schedule: DampingSchedule,
 ) -> tuple[Floats, Bools, Bools, Floats, Floats]:  # fmt: skip
@@ -104,7 +104,8 @@ def refine_poses(
         points: Landmarks, world frame, (B, N, 3).
         scale: Scale of the whitened residuals, (B, 3, N).
         offset: Offset of the whitened residuals, (B, 3, N).
-        chi2_thresholds: Squared residual up to which a measurement is an inlier, (B, N).
+        thresholds: Squared residual at which Huber's loss turns linear, and up to which a measurement is an inlier,
+            (B, N).
         weights: Weight of each measurement, (B, N).
         valid: Measurements that are not padding, (B, N).
         rounds: Maximum number of rounds; the first half of them is robust.
@@ -122,7 +123,7 @@ def refine_poses(
     chi2, information = np.empty(valid.shape), np.empty((len(T_cw), 6, 6))
     for b in range(len(T_cw)):
         refined[b], chi2[b], information[b] = _refine(
-            T_cw[b], points[b], scale[b], offset[b], chi2_thresholds[b], weights[b], valid[b], rounds, iterations,
+            T_cw[b], points[b], scale[b], offset[b], thresholds[b], weights[b], valid[b], rounds, iterations,
             tolerance, regularisation, min_depth, damping_schedule, inliers[b], active[b],
         )  # fmt: skip
     return refined, inliers, active, chi2, information

@@ -28,7 +28,7 @@ def transform(T: Floats, x: float, y: float, z: float) -> tuple[float, float, fl
 
 @device
 def huber(squared: float, threshold: float) -> tuple[float, float]:
-    """Cost and weight of a squared error; the threshold is the squared error at which the kernel turns linear."""
+    """Cost and weight of a squared error; the threshold is the squared error at which the loss turns linear."""
     weight = min(math.sqrt(threshold / max(squared, 1e-300)), 1.0)
     return squared * weight * (2 - weight), weight
 

@@ -17,11 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
-from v3d_torch.optim.implicit import needs_gradient
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, levenberg_marquardt
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import SCHUR_REGULARISATION
@@ -30,7 +30,7 @@ from v3d_torch.runtime.batches import from_rows, to_rows
 _Array = NDArray[Any]
 
 SortedProblem = tuple[_Array, _Array, _Array, _Array, _Array, _Array, _Array]
-"""Arguments of the kernels: scale, offset, chi-square threshold, weight and pose of the observations sorted by point;
+"""Arguments of the kernels: scale, offset, threshold, weight and pose of the observations sorted by point;
 first observation of each point; free poses."""
 
 
@@ -80,7 +80,7 @@ def bundle_adjust(
         \min_{\{T_i\}, \{X_k\}} \sum_{i, k} w_{ik}\, \rho\left( \frac{\|u_{ik} - \pi(T_i X_k)\|^2}{\sigma_{ik}^2}
             + \frac{(1 / z_{ik} - 1 / \hat z_{ik})^2}{\sigma_d^2} \right)
 
-    with Huber's kernel :math:`\rho`. The landmarks are eliminated; memory grows with P times L.
+    with Huber's loss :math:`\rho`. The landmarks are eliminated; memory grows with P times L.
 
     The result is differentiable in all inputs except the initial poses and points, by the implicit function theorem:
     memory does not grow with the iterations. The Hessian is that of the robust cost, including the dependence of the

@@ -14,9 +14,10 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.gradients import zero_with_gradient
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.compiler import can_read
-from v3d_torch.optim.implicit import jacobian, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.reprojection import (
     chi_square,
@@ -43,7 +44,7 @@ class BundleResiduals(NamedTuple):
         projected: Observed points projected by `perspective`, shape :math:`(..., 3, M)`.
         R_cw: World-to-camera rotations, shape :math:`(..., 3, 3, M)`.
         whitened: Residuals divided by their standard deviations, shape :math:`(..., 3, M)`.
-        weights: Weights in the normal equations: given weight times weight of Huber's kernel, shape :math:`(..., M)`.
+        weights: Weights in the normal equations: given weight times weight of Huber's loss, shape :math:`(..., M)`.
     """
 
     in_camera: Tensor
@@ -59,7 +60,7 @@ class BundleProblem(NamedTuple):
     Attributes:
         scale: Scale of the residuals, see `whiten`, shape :math:`(..., 3, M)`.
         offset: Offset of the residuals, shape :math:`(..., 3, M)`.
-        thresholds: Squared residual at which Huber's kernel turns linear, shape :math:`(..., M)`.
+        thresholds: Squared residual at which Huber's loss turns linear, shape :math:`(..., M)`.
         weights: Weight of each observation, 0 for padding, shape :math:`(..., M)`.
         pose: Index of the pose of each observation, int64, shape :math:`(..., M)`.
         point: Index of the point of each observation, int64, shape :math:`(..., M)`.

@@ -46,7 +46,10 @@ def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Ten
 
 
 def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
-    """Find the landmarks that any of the given keyframes observes.
+    """Find the landmarks that any of the given keyframes observes or observed.
+
+    Observations that a bundle adjustment removed as outliers count, too: their landmarks are in view, and those that
+    others observe can be matched there.
 
     Args:
         tables: Data of the map.
@@ -55,6 +58,7 @@ def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
     Returns:
         IDs, ascending, int64, shape :math:`(L,)`.
     """
+    # Without the removed observations, tracking was less accurate where unmasked people move.
     keyframe, landmark = (tables.observations[name].numpy() for name in ("keyframe", "landmark"))
     observed = np.zeros(len(tables.landmarks), np.bool_)
     observed[landmark[np.flatnonzero(contains(keyframes.numpy(), keyframe, len(tables.keyframes)))]] = True

@@ -90,8 +90,8 @@ def estimate_readout(
         uniform motion, ``seconds`` stays nearly the same and ``information`` is discounted.
 
     Raises:
-        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, or if a
-            pose or landmark is not finite.
+        InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, if a
+            pose or landmark is not finite, or if a weight is negative or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])

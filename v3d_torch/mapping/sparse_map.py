@@ -87,7 +87,7 @@ class SparseMap(MapTables):
             self.landmarks["visible"][visible] += 1
 
     def local_map(self, landmarks: Tensor, count: int) -> LocalMap:
-        """Return the local map: all landmarks that the most covisible keyframes observe.
+        """Return the local map: all landmarks that the most covisible keyframes observe or observed.
 
         Args:
             landmarks: IDs of the landmarks that the previous frame observed, int64, shape :math:`(L,)`.

@@ -166,21 +166,25 @@ class DenseAligner(torch.nn.Module):
         images = grey_a, depth_a, grey_b, depth_b
         for image in images:
             KORNIA_CHECK_SHAPE(image, ["*", "1", str(grey_a.shape[-2]), str(grey_a.shape[-1])])
-        batch, size = common_batch(*(image.shape[:-3] for image in images)), grey_a.shape[-2:]
+        size = grey_a.shape[-2:]
+        pixels = grey_a.new_ones(size, dtype=torch.bool)
+        masks = tuple(pixels if static is None else static for static in (static_a, static_b))
+        for mask in masks:
+            KORNIA_CHECK_SHAPE(mask, ["*", *map(str, size)])
+        motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
+        KORNIA_CHECK_SHAPE(motion, ["*", "4", "4"])
         if size != self._size:
             raise InputError(
                 f"the images have {size[1]} x {size[0]} pixels, the camera {self._size[1]} x {self._size[0]}; give a"
                 " camera of the size of the images"
             )
-        pixels = grey_a.new_ones(size, dtype=torch.bool)
-        motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
+        batch = common_batch(
+            *(image.shape[:-3] for image in images), motion.shape[:-2], *(mask.shape[:-2] for mask in masks)
+        )
         columns = (
             *(image.to(torch.float32).expand(*batch, 1, *size).reshape(-1, 1, *size) for image in images),
             motion.expand(*batch, 4, 4).reshape(-1, 4, 4),
-            *(
-                (pixels if static is None else static).expand(*batch, *size).reshape(-1, *size)
-                for static in (static_a, static_b)
-            ),
+            *(mask.expand(*batch, *size).reshape(-1, *size) for mask in masks),
         )
         alignments = [
             self._align(self.view(grey_a, depth_a, static_a), self.view(grey_b, depth_b, static_b), T_ba)

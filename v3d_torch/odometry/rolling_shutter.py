@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import RollingShutterConfig
@@ -108,10 +109,16 @@ def _compensate_compiled(
     readout_jacobian: Tensor | None = None,
     valid: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
-    is_single = uv.ndim == 2 and velocity.ndim == 1 and K.ndim == 2 and row.shape == inverse_depth.shape == uv.shape[:1]
-    if not is_single or any(each.dtype != torch.float64 for each in (uv, inverse_depth, velocity, K)):
-        return NotImplemented
     if isinstance(readout, Tensor) or readout_jacobian is None or valid is not None or height < _MIN_HEIGHT:
+        return NotImplemented
+    # The kernel does not check what it reads.
+    is_single = (
+        uv.shape == readout_jacobian.shape == (len(row), 2)
+        and row.shape == inverse_depth.shape == uv.shape[:1]
+        and velocity.shape == (6,)
+        and K.shape == (3, 3)
+    )
+    if not is_single or any(each.dtype != torch.float64 for each in (uv, inverse_depth, velocity, K, readout_jacobian)):
         return NotImplemented
     new_uv, new_jacobian = kernels.compensate_rolling_shutter(
         to_array(uv),
@@ -173,6 +180,14 @@ def compensate_rolling_shutter(
         ConfigError: If ``height`` is less than 2.
     """
     check_masks(valid=valid)
+    KORNIA_CHECK_SHAPE(uv, ["*", "N", "2"])
+    KORNIA_CHECK_SHAPE(velocity, ["*", "6"])
+    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    for column in (row, inverse_depth, valid):
+        if column is not None:
+            KORNIA_CHECK_SHAPE(column, ["*", str(uv.shape[-2])])
+    if readout_jacobian is not None:
+        KORNIA_CHECK_SHAPE(readout_jacobian, ["*", str(uv.shape[-2]), "2"])
     if height < _MIN_HEIGHT:
         raise ConfigError(f"height is {height}; give at least {_MIN_HEIGHT} rows")
     seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]

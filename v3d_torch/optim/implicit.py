@@ -11,7 +11,7 @@ the Hessian of the cost, not its Gauss-Newton approximation, so that the derivat
 0.
 
 A solver finds the optimum without gradients. One Newton step from there, with the Hessian held constant, has the value
-0 and the derivative above.
+0 and the derivative above; see `v3d_torch.geometry.gradients`.
 """
 
 from __future__ import annotations
@@ -21,20 +21,6 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 from torch.func import jvp, vmap
-
-from v3d_torch.kernels.compiler import is_transformed
-
-
-def needs_gradient(*tensors: Tensor) -> bool:
-    """Check whether derivatives with respect to any of the tensors are tracked."""
-    if is_transformed():
-        return True
-    return torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-
-
-def zero_with_gradient(step: Tensor) -> Tensor:
-    """Return zero with the derivatives of a Newton step, whose value at the optimum is only the error of the solver."""
-    return step - step.detach()
 
 
 def jacobian(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt optimisation and robust kernels.
+"""Levenberg-Marquardt optimisation and robust losses.
 
 Pose refinement, bundle adjustment, dense alignment and the pose graph share this optimiser.
 """
@@ -40,7 +40,7 @@ _SCALE_ITERATIONS = 10
 
 
 def huber(squared: Tensor, threshold: Tensor | float) -> tuple[Tensor, Tensor]:
-    r"""Huber's kernel on squared errors: quadratic up to the threshold, linear beyond.
+    r"""Huber's loss on squared errors: quadratic up to the threshold, linear beyond.
 
     .. math::
         \rho(s) = s \;\text{if}\; s \le k^2, \; 2 k \sqrt{s} - k^2 \;\text{otherwise}
@@ -49,7 +49,7 @@ def huber(squared: Tensor, threshold: Tensor | float) -> tuple[Tensor, Tensor]:
 
     Args:
         squared: Squared errors :math:`s`, any shape.
-        threshold: Squared error :math:`k^2` at which the kernel turns linear, a number or one for each error.
+        threshold: Squared error :math:`k^2` at which the loss turns linear, a number or one for each error.
 
     Returns:
         Costs :math:`\rho(s)` and weights :math:`d\rho / ds`, both of the shape of ``squared``.
@@ -61,7 +61,7 @@ def huber(squared: Tensor, threshold: Tensor | float) -> tuple[Tensor, Tensor]:
 
 
 def student_t(squared: Tensor, degrees_of_freedom: float) -> tuple[Tensor, Tensor]:
-    r"""Robust kernel of the t-distribution, whose heavy tails model outliers (Kerl et al., ICRA 2013).
+    r"""Robust loss of the t-distribution, whose heavy tails model outliers (Kerl et al., ICRA 2013).
 
     .. math::
         \rho(s) = (\nu + 1) \log(1 + s / \nu), \qquad \rho'(s) = \frac{\nu + 1}{\nu + s}

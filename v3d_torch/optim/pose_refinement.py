@@ -16,11 +16,12 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
-from v3d_torch.optim.implicit import jacobian, needs_gradient, zero_with_gradient
+from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import (
     DAMPING_SCHEDULE,
     POSE_TOLERANCE,
@@ -80,7 +81,7 @@ class _Problem(NamedTuple):
     points: Tensor  # (..., N, 3), landmarks in the world frame, metres
     scale: Tensor  # (..., 3, N)
     offset: Tensor  # (..., 3, N)
-    thresholds: Tensor  # (..., N), chi-square threshold of an inlier
+    thresholds: Tensor  # (..., N), squared residual at which Huber's loss turns linear, and limit of an inlier
     weights: Tensor  # (..., N)
     valid: Tensor  # (..., N), bool
 
@@ -95,9 +96,9 @@ class _Problem(NamedTuple):
 
     def robust_cost(self, at: _Residuals, active: Tensor, *, robust: bool) -> tuple[Tensor, Tensor]:
         """Cost of the active measurements, (...), and the weights of all in the normal equations, (..., N)."""
-        costs, weights = huber(at.squared, self.thresholds if robust else torch.inf)
-        influence = self.weights * active
-        return (costs * influence).sum(dim=-1), weights * influence
+        costs, robust_weights = huber(at.squared, self.thresholds if robust else torch.inf)
+        weights = self.weights * active
+        return (costs * weights).sum(dim=-1), robust_weights * weights
 
     def normal_equations(self, at: _Residuals, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Half of the Gauss-Newton Hessian, (..., 6, 6), and half of the gradient, (..., 6), of the cost."""
@@ -156,7 +157,7 @@ def refine_pose(
             + \frac{(1 / z_k - 1 / \hat z_k)^2}{\sigma_d^2} \right)
 
     in rounds: each round optimises the pose on the current inliers, then classifies all measurements again. The first
-    half of the rounds uses Huber's kernel; the other half uses plain least squares. With one round, the pose is the
+    half of the rounds uses Huber's loss; the other half uses plain least squares. With one round, the pose is the
     robust optimum of all measurements.
 
     The result is differentiable in all inputs except the prediction, by the implicit function theorem: memory does
@@ -267,7 +268,7 @@ def refine_pose_unchecked(
 
 
 def _is_robust(index: int, rounds: int) -> bool:
-    """Check whether a round uses Huber's kernel: the first half of the rounds does."""
+    """Check whether a round uses Huber's loss: the first half of the rounds does."""
     return 2 * index < rounds
 
 

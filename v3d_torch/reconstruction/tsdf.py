@@ -8,6 +8,8 @@ Convention: a voxel is a sample at the point ``index * voxel size`` of the world
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -34,14 +36,17 @@ def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
     Returns:
         Unique block coordinates in ascending order, int64, shape :math:`(N, 3)`.
     """
+    side = BLOCK * config.mesh.voxel_size
+    # Steps along a ray of at most one block, so that no block between them is missed.
+    steps = torch.linspace(-1, 1, 2 * math.ceil(config.mesh.truncation / side) + 1, dtype=torch.float64)
     found = [torch.zeros(0, dtype=torch.int64)]
     for view in views:
         depth = view.depth
         valid = (depth > 0) & (depth <= config.max_depth)
         points = back_project(depth[None, None], views.rays)[0][valid].to(torch.float64)
         offset = config.mesh.truncation * points / points.norm(dim=1, keepdim=True)
-        points = transform_points(view.T_wd, torch.cat([points - offset, points, points + offset]))
-        blocks = (points / (BLOCK * config.mesh.voxel_size)).floor().to(torch.int64)
+        points = transform_points(view.T_wd, torch.cat([points + step * offset for step in steps]))
+        blocks = (points / side).floor().to(torch.int64)
         found.append(cell_keys(blocks).unique())
     return cells_of_keys(torch.cat(found).unique())
 

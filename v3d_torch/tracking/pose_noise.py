@@ -70,17 +70,21 @@ class PoseNoise:
         """Start a new sequence of poses, after a frame without a pose or a jump of the pose."""
         self._window = []
 
-    def scale(self, covariance: Tensor, variance: float = 1.0) -> Tensor:
-        """Covariance of a pose, given its nominal covariance, both float64 of shape :math:`(6, 6)`.
+    def scale(self, covariance: Tensor, *variances: float) -> list[Tensor]:
+        """Covariances of a pose with different errors, given its nominal covariance.
 
         Args:
-            covariance: Nominal covariance.
-            variance: Variance of its error relative to the variance of a frame, see `MapNoise`. The minimum ratio is
-                that of the whole error.
+            covariance: Nominal covariance, float64, shape :math:`(6, 6)`.
+            variances: Variances of its error relative to the variance of a frame: 1 for the noise of the frame, more
+                with that of the map, see `MapNoise`. The minimum ratio is that of the whole error.
+
+        Returns:
+            A covariance for each variance, float64, shape :math:`(6, 6)`.
         """
         ratios, axes = torch.linalg.eigh(self._sum / self._weight)
-        root = torch.linalg.cholesky(covariance) @ axes * (variance * ratios).clamp(min=_MIN_RATIO).sqrt()
-        return root @ root.T
+        whole = torch.linalg.cholesky(covariance) @ axes
+        roots = [whole * (variance * ratios).clamp(min=_MIN_RATIO).sqrt() for variance in variances]
+        return [root @ root.T for root in roots]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the last poses and the average."""

@@ -146,8 +146,9 @@ class StateEstimator:
         """Covariance of a pose that was tracked in the map."""
         nominal = torch.linalg.inv(information + _MIN_INFORMATION * torch.eye(6, dtype=torch.float64))
         self._pose_noise.update(stamp, T_wc, nominal)
-        self._frame_noise, self._owners = self._pose_noise.scale(nominal), owners
-        return self._pose_noise.scale(nominal, 1 + self._map_noise(owners))
+        self._frame_noise, covariance = self._pose_noise.scale(nominal, 1.0, 1 + self._map_noise(owners))
+        self._owners = owners
+        return covariance
 
     def _filter_measured(self, stamp: float, T_wc: Tensor, motion: CameraMotion, *, is_continuous: bool) -> None:
         """Update the filter with a pose; restart it if the pose does not continue a measured one."""
