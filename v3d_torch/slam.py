@@ -77,7 +77,7 @@ _OBJECT_STAGES = "free_space_check", "back_project_instances", "describe_appeara
 class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
-    `preprocess` runs the stages that depend only on the frame, see `FramePreprocessor`; `track` runs the others. Every
+    `preprocess` runs the stages that can run ahead of tracking, see `FramePreprocessor`; `track` runs the others. Every
     stage is an attribute and can be replaced by an object with the same methods; the results of stages that return data
     are checked. `estimate_motion`, `track_map` and `loop_closer` are used inside other stages and cannot be replaced
     alone. Hooks see the arguments and results of stages, see `register_stage_hook`.

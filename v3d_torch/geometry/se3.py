@@ -1,8 +1,9 @@
 """SE(3) as 4x4 matrices: exponential, logarithm, inverse, action on points, adjoint, Jacobian of the logarithm.
 
 Convention: a tangent vector is ``xi = [translation, rotation]``, metres and radians, in the order of PyPose's se(3).
-All functions are batched over leading dimensions, differentiable, and meant for float64; half precision is computed in
-float32. Their results equal those of PyPose, but they use plain matrices, which is faster for single poses.
+All functions are batched over leading dimensions, differentiable, and meant for float64; exponential, logarithm and
+orthonormalisation compute half precision in float32. Their results equal those of PyPose, but they use plain matrices,
+which is faster for single poses.
 
 Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 2018.
 """

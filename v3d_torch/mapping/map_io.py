@@ -109,7 +109,7 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
         raise InputError(f"{path}: is a damaged map file ({problem}); {_FIX}")
     fill_from_columns(columns, stored.map, stored.views)
     own = Readout.from_camera(camera, config.rolling_shutter)
-    stored.map.set_readout(stored.map.readout.continued(own))
+    stored.map.set_readout(stored.map.readout.for_new_run(own))
     return stored
 
 

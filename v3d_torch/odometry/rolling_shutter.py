@@ -68,15 +68,15 @@ class Readout:
             return cls(camera.readout, math.inf)
         return cls(config.readout, config.readout_sigma**-2)
 
-    def continued(self, own: Readout) -> Readout:
-        """Readout of a run that continues with the map of a run with this readout.
+    def for_new_run(self, initial: Readout) -> Readout:
+        """Return the readout with which a new run starts on the map of the run that estimated this one.
 
         Args:
-            own: Readout of the new run before its first frame.
+            initial: Readout of the new run without a map.
         """
-        if own.is_certain:
-            return own
-        return Readout(self.seconds, own.information) if self.is_certain else self
+        if initial.is_certain:
+            return initial
+        return Readout(self.seconds, initial.information) if self.is_certain else self
 
     @classmethod
     def from_dict(cls, attributes: Mapping[str, float]) -> Readout:

@@ -26,10 +26,11 @@ and preprocessing continues meanwhile."""
 
 
 class FramePreprocessor(ReplaceableStages):
-    """Base class of `V3DSLAM`: the stages that depend only on the frame. They can run ahead of tracking.
+    """Base class of `V3DSLAM`: the stages that can run ahead of tracking.
 
-    The state of tracking is neither read nor changed. `segment_instances` and `extract_features` are independent of
-    each other and can run in different threads.
+    They depend on the frame, and on a pose of the camera that was predicted some frames before. The state of tracking
+    is neither read nor changed. `segment_instances` and `extract_features` are independent of each other and can run in
+    different threads.
 
     Args:
         camera: Camera of all frames.

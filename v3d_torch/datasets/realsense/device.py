@@ -90,7 +90,7 @@ class PipelineDevice:
         self._stopped = rs.playback_status.stopped
 
     def measure_accelerations(self) -> NDArray[np.float64]:
-        """Measure accelerations for a short time, see `measure_accelerations`."""
+        """Measure the accelerations of the camera for a short time, m/s^2, see the module `accelerometer`."""
         return measure_accelerations(self._source, self._device, self._colour)
 
     def start(self) -> None:
