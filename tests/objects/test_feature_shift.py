@@ -34,7 +34,7 @@ def scene(
     residuals[::3] = torch.nan  # not matched
     wrong = torch.rand(len(pixel), generator=generator) < 0.2
     residuals[wrong] = 30 * torch.randn(int(wrong.sum()), 2, generator=generator, dtype=torch.float64)
-    return feature_shifts(pixel, residuals, [mask])
+    return feature_shifts(pixel, residuals, inside[None], mask.shape)
 
 
 def total(frames: int, shift: tuple[float, float], **settings: float) -> FeatureShift:
@@ -91,23 +91,26 @@ def test_variance_is_that_of_the_median() -> None:
 
 def test_few_features_tell_nothing() -> None:
     assert scene(0, (9.0, 0.0), on_object=8) == [None]
-    assert feature_shifts(torch.zeros(0, 2).long(), torch.zeros(0, 2).double(), [torch.ones(4, 4).bool()]) == [None]
-    assert feature_shifts(torch.zeros(0, 2).long(), torch.zeros(0, 2).double(), []) == []
+    for objects in (0, 1):
+        on_objects = torch.ones(objects, 0, dtype=torch.bool)
+        shifts = feature_shifts(torch.zeros(0, 2).long(), torch.zeros(0, 2).double(), on_objects, (4, 4))
+        assert shifts == objects * [None]
 
 
 def test_nothing_is_known_without_other_places() -> None:
     """The object fills the image."""
     pixel = torch.stack([torch.arange(100), torch.arange(100)], dim=1)
     residuals = torch.full((100, 2), 9.0, dtype=torch.float64)
-    (shift,) = feature_shifts(pixel, residuals, [torch.ones(HEIGHT, WIDTH, dtype=torch.bool)])
+    (shift,) = feature_shifts(pixel, residuals, torch.ones(1, 100, dtype=torch.bool), (HEIGHT, WIDTH))
     assert shift is not None and bool(shift.elsewhere.isnan().all()) and not shift.is_motion
 
 
 def displaced(masks: list[Tensor]) -> list[FeatureShift | None]:
     pixel = torch.cartesian_prod(torch.arange(0, WIDTH, 4), torch.arange(0, HEIGHT, 4))
     residuals = torch.zeros(len(pixel), 2, dtype=torch.float64)
-    residuals[masks[1][pixel[:, 1], pixel[:, 0]]] = 5.0
-    return feature_shifts(pixel, residuals, masks)
+    on_objects = torch.stack([mask[pixel[:, 1], pixel[:, 0]] for mask in masks])
+    residuals[on_objects[1]] = 5.0
+    return feature_shifts(pixel, residuals, on_objects, (HEIGHT, WIDTH))
 
 
 def test_shifts_are_in_the_order_of_the_masks() -> None:

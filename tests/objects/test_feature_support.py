@@ -32,43 +32,57 @@ def scene(fitting: float, outside: float = 0.5, count: int = 100) -> tuple[Featu
 )
 def test_object_with_half_the_outside_inlier_ratio_is_supported(fitting: float, supported: bool) -> None:
     support, mask = scene(fitting)
-    assert support.supports(mask, 0.5, 10).tolist() == [supported]
+    assert support.supports(support.on_objects(mask)).tolist() == [supported]
 
 
 @pytest.mark.parametrize(("count", "supported"), [(9, False), (10, True)])
 def test_too_few_inliers_support_no_object(count: int, supported: bool) -> None:
     support, mask = scene(1.0, count=count)
-    assert support.supports(mask, 0.5, 10).tolist() == [supported]
+    assert support.supports(support.on_objects(mask)).tolist() == [supported]
 
 
 @pytest.mark.parametrize(("ratio", "supported"), [(0.5, True), (0.25, True), (0.24, False), (0.12, False)])
 def test_object_over_the_whole_image_is_compared_with_the_usual_inlier_ratio(ratio: float, supported: bool) -> None:
     support, _ = scene(ratio, outside=ratio)
     everything = torch.ones(1, HEIGHT, WIDTH, dtype=torch.bool)
-    assert support.supports(everything, 0.5, 10).tolist() == [supported]
+    assert support.supports(support.on_objects(everything)).tolist() == [supported]
 
 
 def test_no_features_and_no_objects_are_accepted() -> None:
     no_features = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
-    assert no_features.supports(torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).tolist() == [False, False]
+    everything = torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool)
+    assert no_features.supports(no_features.on_objects(everything)).tolist() == [False, False]
     support, _ = scene(0.5)
-    assert support.supports(torch.zeros(0, HEIGHT, WIDTH, dtype=torch.bool), 0.5, 10).shape == (0,)
+    assert support.supports(support.on_objects(everything[:0])).shape == (0,)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 50), st.integers(1, 50), st.integers(0, 30))
+def test_features_on_objects_are_those_on_the_pixels_of_their_masks(
+    seed: int, height: int, width: int, count: int
+) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    masks = torch.rand(3, height, width, generator=generator) > 0.5
+    u, v = (torch.randint(0, size, (count,), generator=generator) for size in (width, height))
+    support = FeatureSupport(torch.stack([u, v], dim=1), torch.zeros(count, dtype=torch.bool))
+    assert torch.equal(support.on_objects(list(masks)), masks[:, v, u])
 
 
 @settings(max_examples=30)
-@given(st.integers(0, 2**31), st.integers(1, 4), st.floats(0.1, 1.0), st.integers(1, 8))
-def test_support_equals_counting_one_by_one(seed: int, objects: int, min_ratio: float, min_inliers: int) -> None:
+@given(st.integers(0, 2**31), st.integers(1, 4), st.floats(0.1, 1.0), st.integers(20, 120))
+def test_support_equals_counting_one_by_one(seed: int, objects: int, fitting: float, count: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     masks = torch.rand(objects, HEIGHT, WIDTH, generator=generator) > 0.7
-    pixel = torch.stack([torch.randint(0, n, (60,), generator=generator) for n in (WIDTH, HEIGHT)], dim=1)
-    inlier = torch.rand(60, generator=generator) > 0.5
-    supported_objects = FeatureSupport(pixel, inlier).supports(masks, min_ratio, min_inliers)
+    pixel = torch.stack([torch.randint(0, n, (count,), generator=generator) for n in (WIDTH, HEIGHT)], dim=1)
+    on_first = masks[0, pixel[:, 1], pixel[:, 0]]
+    inlier = torch.rand(count, generator=generator) < torch.where(on_first, fitting / 2, fitting)
+    support = FeatureSupport(pixel, inlier)
+    supported_objects = support.supports(support.on_objects(masks))
     outside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if not masks[:, v, u].any()]
     outside_ratio = sum(outside) / max(len(outside), 1)
     if len(outside) < 20:  # too few to know the ratio
         outside_ratio = max(outside_ratio, 0.5)
     for mask, supported in zip(masks, supported_objects.tolist(), strict=True):
         inside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if mask[v, u]]
-        margin = sum(inside) - min_ratio * outside_ratio * len(inside)
+        margin = sum(inside) - 0.5 * outside_ratio * len(inside)
         if abs(margin) > 1e-4:
-            assert supported == (sum(inside) >= min_inliers and margin > 0)
+            assert supported == (sum(inside) >= 10 and margin > 0)

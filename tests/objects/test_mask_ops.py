@@ -1,4 +1,4 @@
-"""Operations on masks: values at pixels, cropping, subsampling."""
+"""Operations on masks: cropping, subsampling."""
 
 from __future__ import annotations
 
@@ -7,15 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3d_torch.objects.mask_ops import crop_around, look_up, subsample
-
-
-@given(seed=st.integers(0, 2**16), height=st.integers(1, 12), width=st.integers(1, 12), count=st.integers(0, 20))
-def test_look_up_equals_indexing(seed: int, height: int, width: int, count: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    masks = torch.rand(3, height, width, generator=generator) < 0.5
-    u, v = (torch.randint(size, (count,), generator=generator) for size in (width, height))
-    assert torch.equal(look_up(list(masks), torch.stack([u, v], dim=1)), masks[:, v, u])
+from v3d_torch.objects.mask_ops import crop_around, subsample
 
 
 @given(step=st.integers(1, 5), height=st.integers(1, 12), width=st.integers(1, 12))

@@ -17,8 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.objects.mask_ops import look_up
-
 _MIN_FEATURES = 8
 """Minimum number of matched features whose median is known well enough."""
 
@@ -83,26 +81,27 @@ def sum_shifts(shifts: Iterable[FeatureShift]) -> FeatureShift:
     return FeatureShift((sum(u), sum(v)), sum(variances), len(elsewhere) * torch.stack(elsewhere).nanmean(dim=0))
 
 
-def feature_shifts(pixel: Tensor, residuals: Tensor, masks: Sequence[Tensor]) -> list[FeatureShift | None]:
+def feature_shifts(
+    pixel: Tensor, residuals: Tensor, on_objects: Tensor, size: Sequence[int]
+) -> list[FeatureShift | None]:
     """Measure the shift of each object in a frame.
 
     Args:
         pixel: Pixel (column, row) of each feature, int64, shape :math:`(N, 2)`.
         residuals: Displacement of each feature against the camera motion, pixels, float64, shape :math:`(N, 2)`; NaN if
             it is not known.
-        masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
+        on_objects: Features on each of K objects, bool, shape :math:`(K, N)`.
+        size: Height and width of the image, pixels.
 
     Returns:
         Shift of each object; None if too few displacements are known.
     """
     known = torch.nonzero(residuals.isfinite().all(dim=1))[:, 0]
-    if len(masks) == 0 or len(known) < _MIN_FEATURES:
-        return [None] * len(masks)
-    pixel, displacement = pixel[known], residuals[known].numpy()
-    inside = look_up(masks, pixel).numpy()
+    inside = on_objects[:, known].numpy()
     if (inside.sum(axis=1) < _MIN_FEATURES).all():
-        return [None] * len(masks)
-    (u, v), (height, width) = pixel.T, masks[0].shape
+        return [None] * len(on_objects)
+    displacement = residuals[known].numpy()
+    (u, v), (height, width) = pixel[known].T, size
     cell = (v * _GRID[0] // height * _GRID[1] + u * _GRID[1] // width).numpy()
     outside = ~inside.any(axis=0)
     elsewhere = _displacements_of_cells(displacement[outside], cell[outside])

@@ -10,16 +10,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from v3d_torch.objects.feature_shift import FeatureShift, feature_shifts
-from v3d_torch.objects.mask_ops import look_up
 
-MIN_SUPPORT_RATIO = 0.5
+_MIN_SUPPORT_RATIO = 0.5
 """Minimum inlier ratio of the features of a supported object, as a fraction of the inlier ratio outside of all objects:
 on a static object both are similar, on a walking person nearly no feature is an inlier."""
 
-MIN_SUPPORTING_FEATURES = 10
+_MIN_SUPPORTING_FEATURES = 10
 """Minimum number of inliers on a supported object: a few inliers can lie on the contour of an object in front of it."""
 
 _MIN_OUTSIDE_FEATURES, _USUAL_INLIER_RATIO = 20, 0.5
@@ -43,29 +44,44 @@ class FeatureSupport:
     inliers: Tensor
     residuals: Tensor | None = None
 
-    def supports(
-        self, masks: Sequence[Tensor], min_ratio: float = MIN_SUPPORT_RATIO, min_inliers: int = MIN_SUPPORTING_FEATURES
-    ) -> Tensor:
-        """Find the objects whose features fit the camera motion.
+    def on_objects(self, masks: Sequence[Tensor]) -> Tensor:
+        """Find the features on each object.
 
         Args:
             masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
-            min_ratio: Minimum inlier ratio on the object, relative to the inlier ratio outside of all objects.
-            min_inliers: Minimum number of inliers on the object.
+
+        Returns:
+            Mask of the features of each object, bool, shape :math:`(K, N)`.
+        """
+        if len(masks) == 0:
+            return self.inliers.new_zeros(0, len(self.pixel))
+        # NumPy is faster here than torch.
+        index = (self.pixel[:, 1] * masks[0].shape[1] + self.pixel[:, 0]).numpy()
+        return torch.from_numpy(np.stack([mask.numpy().take(index) for mask in masks]))
+
+    def supports(self, on_objects: Tensor) -> Tensor:
+        """Find the objects whose features fit the camera motion.
+
+        Args:
+            on_objects: Features of each of K objects, see `on_objects`.
 
         Returns:
             Mask of the supported objects, bool, shape :math:`(K,)`.
         """
-        if len(masks) == 0:
-            return self.inliers.new_zeros(0)
-        inside = look_up(masks, self.pixel)
-        outside = ~inside.any(dim=0)
+        outside = ~on_objects.any(dim=0)
         outside_ratio = (self.inliers & outside).sum() / outside.sum().clamp(min=1)
         if int(outside.sum()) < _MIN_OUTSIDE_FEATURES:
             outside_ratio = outside_ratio.clamp(min=_USUAL_INLIER_RATIO)
-        counts, features = (inside & self.inliers).sum(dim=1), inside.sum(dim=1)
-        return (counts >= min_inliers) & (counts >= min_ratio * outside_ratio * features)
+        counts, features = (on_objects & self.inliers).sum(dim=1), on_objects.sum(dim=1)
+        return (counts >= _MIN_SUPPORTING_FEATURES) & (counts >= _MIN_SUPPORT_RATIO * outside_ratio * features)
 
-    def shifts(self, masks: Sequence[Tensor]) -> list[FeatureShift | None]:
-        """Measure how far the features on objects move together, see `feature_shifts`; None if this is not known."""
-        return [None] * len(masks) if self.residuals is None else feature_shifts(self.pixel, self.residuals, masks)
+    def shifts(self, on_objects: Tensor, size: Sequence[int]) -> list[FeatureShift | None]:
+        """Measure how far the features on objects move together, see `feature_shifts`; None if this is not known.
+
+        Args:
+            on_objects: Features of each of K objects, see `on_objects`.
+            size: Height and width of the image, pixels.
+        """
+        if self.residuals is None:
+            return [None] * len(on_objects)
+        return feature_shifts(self.pixel, self.residuals, on_objects, size)

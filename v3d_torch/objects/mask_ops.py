@@ -1,4 +1,4 @@
-"""Operations on image masks: values at pixels, cropping, subsampling, nearest-neighbour upsampling and dilation.
+"""Operations on image masks: cropping, subsampling, nearest-neighbour upsampling and dilation.
 
 NumPy copies bytes several times faster here than torch.
 """
@@ -22,17 +22,6 @@ Crop = tuple[slice, slice]
 
 _MAX_COMPILED_RADIUS = 254
 """Maximum radius of the compiled dilation, pixels: the kernel stores distances up to the radius plus one as uint8."""
-
-
-def look_up(masks: Sequence[Tensor], pixel: Tensor) -> Tensor:
-    """Return the value of each mask at each pixel, bool, shape :math:`(K, N)`.
-
-    Args:
-        masks: K > 0 masks, bool, each of shape :math:`(H, W)`.
-        pixel: Pixels (column, row), int64, shape :math:`(N, 2)`.
-    """
-    index = (pixel[:, 1] * masks[0].shape[1] + pixel[:, 0]).numpy()
-    return torch.from_numpy(np.stack([mask.numpy().take(index) for mask in masks]))
 
 
 def crop_around(mask: NDArray[np.uint8], margin: int, step: int = 1) -> Crop | None:

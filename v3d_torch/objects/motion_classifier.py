@@ -104,7 +104,9 @@ class MotionClassifier:
         # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
         vote = hough_vote_evidence(detected, pairs, free_space, self._last_stamp, config.voting)
         # Independent evidence, not in the paper: features, which show slow motions earlier.
-        shifted = self._shifted_tracks(tracks, feature_support, stamp)
+        # A mask can contain other objects: the arms of people who sit at a table are in the mask of the table.
+        on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
+        shifted = self._shifted_tracks(tracks, feature_support, on_objects, view)
         for track in vote.dynamic | shifted:
             track.mark_dynamic(stamp)
 
@@ -116,8 +118,7 @@ class MotionClassifier:
         self._last_stamp = stamp
 
         # Motion states, with memory over frames.
-        supported = feature_support.supports([track.cloud_pixels for track in tracks]).tolist()
-        for track, is_supported in zip(tracks, supported, strict=True):
+        for track, is_supported in zip(tracks, feature_support.supports(on_objects).tolist(), strict=True):
             track.mark_supported(stamp, is_supported)
         motion_states = {track: self._motion_state(track, free_space.appeared[track], stamp) for track in tracks}
 
@@ -129,6 +130,7 @@ class MotionClassifier:
             [refined[track] for track in excluded], list(refined.values()), view.missing.shape, config.static_mask
         )
 
+        visible = visible_masks(tracks, refined, view.missing)
         objects = [
             TrackedObject(
                 id=track.id,
@@ -140,7 +142,7 @@ class MotionClassifier:
                 missed=track.missed,
                 **_place(track, stamp),
             )
-            for track, mask in zip(tracks, visible_masks(tracks, refined, view.missing), strict=True)
+            for track, mask in zip(tracks, visible, strict=True)
         ]
         return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
 
@@ -204,15 +206,16 @@ class MotionClassifier:
             if track.label in LIVING and not self._is_held_dynamic(track, stamp)
         }
 
-    def _shifted_tracks(self, tracks: Sequence[Track], feature_support: FeatureSupport, stamp: float) -> set[Track]:
-        """Return the objects whose features have moved against the camera motion."""
+    def _shifted_tracks(
+        self, tracks: Sequence[Track], feature_support: FeatureSupport, on_objects: Tensor, view: DepthView
+    ) -> set[Track]:
+        """Return the objects whose features, given for each of them, have moved against the camera motion."""
         config = self._config.feature_shift
         if not config.enabled:
             return set()
-        # A mask can contain other objects: the arms of people who sit at a table are in the mask of the table.
-        for track, shift in zip(tracks, feature_support.shifts([each.cloud_pixels for each in tracks]), strict=True):
-            track.add_shift(stamp, shift, config.time_span)
-        return {track for track in tracks if track.last_shifted == stamp}
+        for track, shift in zip(tracks, feature_support.shifts(on_objects, view.missing.shape), strict=True):
+            track.add_shift(view.stamp, shift, config.time_span)
+        return {track for track in tracks if track.last_shifted == view.stamp}
 
     def _motion_state(self, track: Track, appeared: list[float], stamp: float) -> MotionState:
         """Return the motion state of an object.
