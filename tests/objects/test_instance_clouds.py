@@ -166,12 +166,28 @@ def test_largest_of_two_parts_is_kept_in_any_order() -> None:
         assert error(clouds) < RIM
 
 
-def test_object_split_by_an_occluder_keeps_one_part() -> None:
+@pytest.mark.parametrize(
+    ("offset", "is_kept"), [(0.0, True), (0.08, True), (-0.08, True), (0.12, False), (-0.12, False)]
+)
+def test_object_split_by_an_occluder_keeps_both_parts_if_they_have_nearly_the_same_depth(
+    offset: float, is_kept: bool
+) -> None:
     depth = board()
-    pole = rectangle((320, 350), (0, 480))
+    pole, left, right = rectangle((320, 350), (0, 480)), rectangle((280, 320)), rectangle((350, 400))
+    depth[0, left] = OBJECT + offset
     depth[0, pole] = 1.0
     clouds = back_project(depth, rectangle() & ~pole)
-    assert error(clouds, (350, 400)) < RIM
+    kept = [float(clouds.cloud_pixels[0][part].double().mean()) for part in (left, right)]
+    assert kept[1] > 0.94 and (kept[0] > 0.94 if is_kept else kept[0] == 0)
+
+
+@pytest.mark.parametrize(("width", "is_kept"), [(30, False), (50, True)])
+def test_cluster_with_less_than_a_fifth_of_the_points_is_no_part_of_the_object(width: int, is_kept: bool) -> None:
+    large, small = rectangle((100, 300)), rectangle((340, 340 + width))
+    depth = torch.full((1, CAMERA.height, CAMERA.width), WALL)
+    depth[0, large | small] = OBJECT
+    clouds = back_project(depth, large | small)
+    assert bool(clouds.cloud_pixels[0][small].any()) is is_kept
 
 
 def test_clusters_equal_scikit_learn() -> None:

@@ -9,14 +9,32 @@ from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.dbscan import dbscan
 from v3d_torch.kernels.voxel import pool_voxels
 
+MIN_PART_SIZE = 0.2
+"""Minimum number of points of another part of an object, as a fraction of those of its largest cluster."""
+
+MAX_PART_OFFSET = 0.1
+"""Maximum difference between the mean depths of another part of an object and its largest cluster, metres: about half
+of the depth of a body."""
+
 
 @device
-def _select_largest(labels: Ints) -> Bools:
-    """Mask of the points of the largest cluster, shape (N,); of equal clusters, the one with the lower label."""
-    sizes = np.zeros(len(labels) + 1, np.int64)
-    for label in labels:
-        sizes[label] += label >= 0
-    return labels == (sizes.argmax() if sizes.max() > 0 else len(labels))
+def _select_object(labels: Ints, points: Floats32) -> Bools:
+    """Mask of the points of the largest cluster and of other parts of the object, shape (N,).
+
+    Of equal clusters, the one with the lower label counts as the largest.
+    """
+    sizes, depths = np.zeros(len(labels) + 1, np.int64), np.zeros(len(labels) + 1)
+    for i, label in enumerate(labels):
+        if label >= 0:
+            sizes[label] += 1
+            depths[label] += points[i, 2]
+    largest = sizes.argmax()
+    selected = np.zeros(len(labels), np.bool_)
+    for i, label in enumerate(labels):
+        if label >= 0:
+            offset = abs(depths[label] / sizes[label] - depths[largest] / sizes[largest])
+            selected[i] = offset <= MAX_PART_OFFSET and sizes[label] >= MIN_PART_SIZE * sizes[largest]
+    return selected
 
 
 @kernel("(f4[:,::1], b1[:,::1], f4[:,::1], i8, f4, f4, f8, i8, b1[:,::1])")
@@ -24,7 +42,7 @@ def instance_cloud(
     depth: Floats32, mask: Bools, rays: Floats32, stride: int, max_depth: np.float32, voxel_size: np.float32,
     eps: float, min_samples: int, cloud_pixels: Bools,
 ) -> tuple[Floats32, Bools]:  # fmt: skip
-    """Back-project one instance, pool its points, and select the largest cluster.
+    """Back-project one instance, pool its points, and select the clusters of the object.
 
     Args:
         depth: Depth, metres, (H, W); 0 = no measurement.
@@ -35,10 +53,10 @@ def instance_cloud(
         voxel_size: Side of a voxel, metres.
         eps: Radius of DBSCAN, metres.
         min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
-        cloud_pixels: Pixels of the mask whose point belongs to the largest cluster, (H, W), written; false before.
+        cloud_pixels: Pixels of the mask whose point belongs to the object, (H, W), written; false before.
 
     Returns:
-        Mean point of each voxel, metres, (M, 3), and mask of the voxels in the largest cluster, (M,).
+        Mean point of each voxel, metres, (M, 3), and mask of the voxels of the object, (M,).
     """
     height, width = depth.shape
     points, pixels, count, ray = np.empty((len(rays), 3), np.float32), np.empty((len(rays), 2), np.int64), 0, 0
@@ -54,7 +72,7 @@ def instance_cloud(
     means, _, voxels = pool_voxels(points[:count], voxel_size, np.inf)
     if len(means) == 0:  # also if a point is not finite: it has no voxel
         return means, np.zeros(0, np.bool_)
-    selected = _select_largest(dbscan(means.astype(np.float64), eps, min_samples))
+    selected = _select_object(dbscan(means.astype(np.float64), eps, min_samples), means)
     for i in range(count):
         if selected[voxels[i]]:
             row, column = pixels[i]

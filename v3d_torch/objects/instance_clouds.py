@@ -1,4 +1,8 @@
-"""Clean point clouds of instances: back-projection, voxel pooling, DBSCAN, largest cluster (paper, Sec. III-B.2)."""
+"""Clean point clouds of instances: back-projection, voxel pooling, DBSCAN, selection of clusters (paper, Sec. III-B.2).
+
+The largest cluster is the object. Something in front can divide the object, such as a box that a person carries: other
+large clusters of nearly the same depth are parts of it. The background in a coarse mask is farther away, or small.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,7 @@ class InstanceClouds:
     Attributes:
         points: Voxel means of the masked pixels, outliers included, camera frame, metres, float32, shape
             :math:`(N, P, 3)`.
-        valid: Mask of the points of the object, the largest cluster, bool, shape :math:`(N, P)`; False for outliers and
+        valid: Mask of the points of the object, bool, shape :math:`(N, P)`; False for outliers and
             padding.
         centroid: Mean of the points, float32, shape :math:`(N, 3)`; NaN if a cloud has too few points.
         cloud_pixels: Pixels of each mask whose point belongs to the cloud, bool, shape :math:`(N, H, W)`.
@@ -96,9 +100,24 @@ def _compute_clouds(depth: Tensor, masks: Tensor, rays: NDArray[np.float32], con
     points, valid, pixel = _back_project(depth, masks, rays, config)
     points, valid, _, voxel = voxel_pool(points, valid, config.voxel_size)
     labels = dbscan(points, valid, config.eps, config.min_samples)
-    # The paper keeps as many clusters as there are instances. Here each instance has its own cloud, with one cluster.
-    valid = largest_clusters(labels, valid, 1)
+    # The paper keeps as many clusters as there are instances. Here each instance has its own cloud.
+    valid = _select_object(points, labels, valid)
     return _with_centroids(points, valid, _cloud_pixels(masks, valid, voxel, pixel, config.stride), config.min_points)
+
+
+def _select_object(points: Tensor, labels: Tensor, valid: Tensor) -> Tensor:
+    """Select the points (N, P) of the largest cluster of each cloud and of the other parts of the object."""
+    largest, cluster = largest_clusters(labels, valid, 1), labels.clamp(min=0)
+    if labels.numel() == 0:
+        return largest
+    clustered = (valid & (labels >= 0)).to(torch.float64)
+    nothing = torch.zeros_like(clustered)
+    size = nothing.scatter_add(1, cluster, clustered)
+    depth = nothing.scatter_add(1, cluster, points[..., 2] * clustered) / size
+    of_largest = torch.where(largest, cluster, 0).amax(dim=1, keepdim=True)
+    is_part = (depth - depth.gather(1, of_largest)).abs() <= kernels.MAX_PART_OFFSET
+    is_part &= size >= kernels.MIN_PART_SIZE * size.gather(1, of_largest)
+    return (clustered > 0) & is_part.gather(1, cluster)
 
 
 def _with_centroids(points: Tensor, valid: Tensor, cloud_pixels: Tensor, min_points: int) -> InstanceClouds:

@@ -174,8 +174,8 @@ class MaskRefiner:
         """Return an object's pixels and other parts of the network's mask, bool, shape (h, w).
 
         A network sometimes draws one mask over two people; the second one is not known background. The points of the
-        object are the largest cluster, which lacks the body if an arm is far in front of it: what belonged to the
-        object at its last detection is not lost.
+        object lack the body if an arm is far in front of it and larger: what belonged to the object at its last
+        detection is not lost.
         """
         stride, segmented = self._stride, track.mask.numpy()[crop]
         parts = _wide_parts(segmented[::stride, ::stride] & ~surface[::stride, ::stride], stride)
