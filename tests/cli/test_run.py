@@ -367,6 +367,7 @@ def test_8_bit_depth_is_rejected(copy: Path, tmp_path: Path) -> None:
     ("file", "words"),
     [
         ("masks/1.0.png", "would be written while it is read"),
+        ("map_masks/1.0.png", "would be written while it is read"),
         ("map.ply", "exists and was not written by a run"),
     ],
 )
@@ -375,7 +376,7 @@ def test_unsuitable_result_folder_leaves_no_recording(file: str, words: str, seq
     path = tmp_path / "out" / file
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("")
-    masks = ("--segmenter", "masks", "--masks", "out/masks") if "masks" in file else ("--segmenter", "none")
+    masks = ("--segmenter", "masks", "--masks", path.parent) if "masks" in file else ("--segmenter", "none")
     done = call_here("--seq", sequence, *masks, "--out", "out", "--rerun", "run.rrd", cwd=tmp_path)
     assert_error_line(done, words)
     assert not (tmp_path / "run.rrd").exists()

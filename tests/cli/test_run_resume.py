@@ -29,7 +29,8 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import OutputError
 from v3d_torch.io.state_file import VERSION
-from v3d_torch.mapping.map_io import load_map
+from v3d_torch.mapping.map_io import load_map, save_map
+from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.pipeline import ViewerGroup
 from v3d_torch.runs import results
 from v3d_torch.runs.file_names import RunFile
@@ -242,18 +243,24 @@ def test_errors_of_results_and_recording_are_both_reported(
 # --- map files
 
 
+def write_earlier_map(path: Path, sequence: Path) -> Path:
+    config = Config()
+    save_map(path, SparseMap(config.mapping, config.features, load_sequence(str(sequence)).camera))
+    return path
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
 def test_interrupted_run_keeps_an_earlier_map_file_until_it_is_resumed(
     sequence: Path, whole_run: Path, tmp_path: Path
 ) -> None:
-    out, room = tmp_path / "out", tmp_path / "room.map"
-    room.write_bytes(b"the map of yesterday")
+    out, room = tmp_path / "out", write_earlier_map(tmp_path / "room.map", sequence)
+    yesterday = room.read_bytes()
     done = interrupt_run(sequence, out, 4, "--save-map", str(room))
     assert_error_line(done, f"interrupted after 5 of {FRAMES} frames", f"; resume with --resume {out})")
     beside = tmp_path / "room.partial.map"
     warning = f"warning: {room}: was not overwritten, because the run ended early; its map is saved to {beside}\n"
     assert warning in done.stdout
-    assert room.read_bytes() == b"the map of yesterday"
+    assert room.read_bytes() == yesterday
     assert load_map(beside, load_sequence(str(sequence)).camera, Config()).map.active_keyframes
     done = call("--resume", out)
     assert done.exit_code == 0 and "was not overwritten" not in done.stdout, done.stderr
@@ -267,8 +274,7 @@ def test_viewer_that_fails_after_the_last_frame_does_not_keep_the_map_from_being
     def fail(*_: object) -> None:
         raise OutputError("demo.rrd: cannot be written")
 
-    room = tmp_path / "room.map"
-    room.write_bytes(b"the map of yesterday")
+    room = write_earlier_map(tmp_path / "room.map", sequence)
     monkeypatch.setattr(ViewerGroup, "finish", fail)
     assert_error_line(call(*run_arguments(sequence, tmp_path / "out", "--save-map", str(room))), "demo.rrd: cannot be")
     assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
@@ -299,14 +305,27 @@ def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
     assert_same_maps(out, whole_run)
 
 
-@pytest.mark.parametrize("earlier", [b"the map of yesterday", None])
-def test_run_without_keyframes_writes_no_map_file(earlier: bytes | None, sequence: Path, tmp_path: Path) -> None:
+def test_file_put_in_place_of_the_map_during_the_run_stays(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
+    out, room, beside = tmp_path / "out", tmp_path / "room.map", tmp_path / "room.partial.map"
+    beside.write_text("my own notes")
+    with at_frame(10, lambda: room.write_text("my notes")):
+        done = call(*run_arguments(sequence, out, "--save-masks", "--serial", "--save-map", str(room)))
+    assert_error_line(done, f"{room}: exists and is not a map", f"; resume with --resume {out})")
+    assert room.read_text() == "my notes" and (out / "map.ply").is_file()
+    room.unlink()
+    done = call("--resume", out)
+    assert done.exit_code == 0, done.stderr
+    assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
+    assert beside.read_text() == "my own notes"
+
+
+@pytest.mark.parametrize("has_earlier", [True, False])
+def test_run_without_keyframes_writes_no_map_file(has_earlier: bool, sequence: Path, tmp_path: Path) -> None:
     dark, room = tmp_path / "dark", tmp_path / "room.map"
     shutil.copytree(sequence, dark)
     for path in (dark / "rgb").iterdir():
         path.write_bytes(base.png(np.zeros_like(cv2.imread(str(path)))))
-    if earlier is not None:
-        room.write_bytes(earlier)
+    earlier = write_earlier_map(room, sequence).read_bytes() if has_earlier else None
     done = call(*run_arguments(dark, tmp_path / "out", "--save-map", str(room)))
     assert_error_line(done, "the colour images are uniform")
     assert f"warning: {room}: was not written, because the map of this run has no keyframes\n" in done.stdout

@@ -27,7 +27,8 @@ from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
-from v3d_torch.runs.file_names import MASKS, RunFile
+from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
+from v3d_torch.runs.map_file import check_map_path
 from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
@@ -171,7 +172,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     """Open the inputs, run and print the summary."""
     console = Console(soft_wrap=True)
     if request.save_map is not None:
-        check_writable(Path(request.save_map))
+        _check_map_path(Path(request.save_map), out, display)
     masks = _path(request.masks)
     if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
         check_unlocked(out)
@@ -213,13 +214,27 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     _print_summary(request, display, folder, pipeline, evaluation, console)
 
 
+def _check_map_path(path: Path, out: Path | None, display: Display) -> None:
+    """Check that a map can be saved to a path, see `check_map_path`.
+
+    Raises:
+        OutputError: If it cannot, or if a recording of the run goes to the same file.
+    """
+    for option, recording in (("--bag", display.bag), ("--rerun", display.rerun_file)):
+        if recording is not None and recording.resolve() == path.resolve():
+            raise OutputError(f"--save-map {path}: is also the file of {option}; choose another file for one of them")
+    check_map_path(path, out)
+    check_writable(path)
+
+
 def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> None:
     """Check that a run would overwrite neither the masks that it reads nor files of the user.
 
     Raises:
         OutputError: If it would.
     """
-    if masks is not None and masks.resolve() == (folder / MASKS).resolve():
+    written = [(folder / name).resolve() for name in (MASKS, MAP_MASKS)]
+    if masks is not None and masks.resolve() in written:
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if not is_resumed:
         find_earlier_results(folder)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from errno import ENOLCK, ENOSYS, EOPNOTSUPP
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -132,6 +133,15 @@ def find_earlier_results(folder: Path) -> list[Path]:
     if earlier and not (folder / RunFile.LOG).is_file():
         raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
     return earlier
+
+
+def is_result(path: Path, folder: Path) -> bool:
+    """Check whether a run writes a path in the folder of its results, or removes it as one of an earlier run."""
+    path, folder = path.resolve(), folder.resolve()
+    if not path.is_relative_to(folder):
+        return False
+    name = path.relative_to(folder).as_posix()
+    return any(fnmatchcase(name, pattern) for pattern in (*_RESULTS, *_UNFINISHED, *_SUBFOLDERS, _LOCK, RunFile.LOG))
 
 
 def clear_earlier_results(folder: Path) -> None:
