@@ -100,6 +100,7 @@ def test_decreasing_stamps_and_unpaired_images_are_dropped(tmp_path: Path) -> No
     assert sequence.stamps.tolist() == pytest.approx([*(10 + i / 10 for i in range(12)), 11.7])
     assert_frame(sequence, 12, 19)
     assert sequence.notes == [
+        "1 of 14 colour images have no depth image within 20 ms and are left out (the last at 11.600000 s)",
         f"{RGB}: the stamps jump back from 11.100000 to 10.050000 s after 12 images; 1 of 15 images are left out",
         f"{DEPTH}: the stamps jump back from 11.104000 to 10.050000 s after 12 images; 1 of 14 images are left out",
     ]

@@ -15,7 +15,7 @@ from torch import Tensor
 from v3d_torch.datasets.camera_fields import camera_from_fields
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.image_sequence import ImageSequence
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, note_unpaired
 from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
@@ -98,6 +98,8 @@ class BagSequence(ImageSequence):
             chosen,
             delays=[depth_stamps[j] - colour_stamps[i] for i, j in pairs],
         )
+        # Never an error: the stamps are those of one recording, in which messages of both topics can be lost.
+        self.pairing_note = note_unpaired(colour_stamps, pairs)
         self._message_indices = [
             (stamps[topics.rgb][colour_stamps[i]], stamps[topics.depth][depth_stamps[j]]) for i, j in pairs
         ]
