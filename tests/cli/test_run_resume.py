@@ -27,6 +27,7 @@ from v3d_torch.cli import run, run_command
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.errors import OutputError
 from v3d_torch.io.state_file import VERSION
 from v3d_torch.mapping.map_io import load_map, save_map
@@ -36,6 +37,7 @@ from v3d_torch.runs import results
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import read_request
+from v3d_torch.runs.result_folder import lock_results
 from v3d_torch.runs.stored_run import read_run
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -151,6 +153,12 @@ def test_interrupted_run_resumes_to_the_same_results(sequence: Path, whole_run: 
     assert_same_maps(tmp_path / "out", whole_run)
 
 
+def test_report_of_the_interrupted_run_is_removed_when_it_is_resumed(out: Path) -> None:
+    (out / RunFile.REPORT).write_text("interrupted")
+    done = call("--resume", out)
+    assert done.exit_code == 0 and not (out / RunFile.REPORT).exists(), done.stderr
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no file size limits")
 def test_temporarily_full_disk_only_prevents_checkpoints(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
     import resource
@@ -204,12 +212,28 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
     assert_same_maps(out, whole_run)
 
 
-def test_folder_in_the_way_to_resume_is_quoted(tmp_path: Path) -> None:
-    folder = tmp_path / "my run"
+def test_folder_in_the_way_to_resume_is_quoted(sequence: Path, tmp_path: Path) -> None:
+    folder, frames = tmp_path / "my run", load_sequence(str(sequence))
     folder.mkdir()
-    assert run_command._way_to_resume(folder) == ""
+    assert run_command._way_to_resume(folder, frames) == ""
     (folder / RunFile.CHECKPOINT).touch()
-    assert run_command._way_to_resume(folder) == f"; resume with --resume '{folder}'"
+    assert run_command._way_to_resume(folder, frames) == f"; resume with --resume '{folder}'"
+    assert run_command._way_to_resume(folder, RealtimePlayback(frames)) == ""  # its frames are gone
+
+
+def test_error_of_a_folder_that_becomes_locked_names_no_way_to_resume(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another run has begun between the check and the lock; the checkpoint is its own."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / RunFile.LOG).touch()
+    (out / RunFile.CHECKPOINT).touch()
+    monkeypatch.setattr(run_command, "check_unlocked", lambda folder: None)
+    with lock_results(out):
+        done = call(*run_arguments(sequence, out))
+    assert_error_line(done, f"{out}: another run or batch is writing to this folder")
+    assert "--resume" not in done.stderr
 
 
 def test_message_of_ctrl_c_while_results_are_written_names_the_way_to_resume(

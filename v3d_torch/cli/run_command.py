@@ -14,10 +14,10 @@ from rich.table import Table
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
-from v3d_torch.datasets import RGBDStream, open_source
+from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
-from v3d_torch.errors import ConfigError, InputError, OutputError
+from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.evaluation import format_coverage, note_too_few_poses
 from v3d_torch.evaluation.outcome import label_sequence
@@ -205,11 +205,13 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
             console,
             checkpoint,
         )
+    except LockedError:  # the checkpoint in the folder is that of the other run
+        raise
     except OutputError as error:
-        raise OutputError(f"{error}{_way_to_resume(folder)}") from error
+        raise OutputError(f"{error}{_way_to_resume(folder, sequence)}") from error
     except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
         raise InputError(
-            f"{folder}: interrupted before the results were written{_way_to_resume(folder)}"
+            f"{folder}: interrupted before the results were written{_way_to_resume(folder, sequence)}"
         ) from interrupt
     _print_summary(request, display, folder, pipeline, evaluation, console)
 
@@ -289,16 +291,20 @@ def _print_summary(
         print_line(console, f"note: no checkpoint was saved, {record.save_error}")
     print_line(console, f"results: {folder}")
     if record.failure is not None:
-        frames = len(pipeline.slam.poses)
-        results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"
+        frames, fix = len(pipeline.slam.poses), _way_to_resume(folder, pipeline.sequence)
+        results = f"the results of the {frames} frames before are in {folder}{fix}"
         raise InputError(f"{record.failure} ({results})")
     if record.diagnosis is not None:
         raise InputError(f"{record.diagnosis} (the results are in {folder})")
 
 
-def _way_to_resume(folder: Path) -> str:
-    """Return the end of a message on a run that ended early: how to resume it; empty if it has no checkpoint."""
-    return f"; resume with --resume {shlex.quote(str(folder))}" if (folder / RunFile.CHECKPOINT).is_file() else ""
+def _way_to_resume(folder: Path, sequence: RGBDStream) -> str:
+    """Return the end of a message on a run that ended early: how to resume it.
+
+    It is empty if the run has no checkpoint, or that of a live stream, which contains no state.
+    """
+    can_resume = isinstance(sequence, RGBDSequence) and (folder / RunFile.CHECKPOINT).is_file()
+    return f"; resume with --resume {shlex.quote(str(folder))}" if can_resume else ""
 
 
 def _summary_table(

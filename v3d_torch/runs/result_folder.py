@@ -12,7 +12,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from v3d_torch.errors import OutputError
+from v3d_torch.errors import LockedError, OutputError
 from v3d_torch.io.paths import folder_name
 from v3d_torch.runs.file_names import FIGURES, MAP_MASKS, MASKS, RunFile
 
@@ -80,7 +80,8 @@ def check_unlocked(folder: Path) -> None:
     """Check that no run or batch is writing to a folder, which can be missing.
 
     Raises:
-        OutputError: If another run or batch is writing to the folder, or if it cannot be made or written.
+        LockedError: If another run or batch is writing to the folder.
+        OutputError: If it cannot be made or written.
     """
     try:
         is_folder = folder.is_dir()
@@ -98,14 +99,15 @@ def lock_results(folder: Path) -> Iterator[None]:
     The lock of a process that is killed ends with it. On a file system without locks, nothing is locked.
 
     Raises:
-        OutputError: If another run or batch is writing to the folder, or if it cannot be written.
+        LockedError: If another run or batch is writing to the folder.
+        OutputError: If it cannot be written.
     """
     lock = FileLock(folder / _LOCK)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise OutputError(
+        raise LockedError(
             f"{folder}: another run or batch is writing to this folder; wait until it ends, or choose another folder"
             " with --out"
         ) from error

@@ -95,6 +95,7 @@ class Run:
         )
         if checkpoint is not None:
             remove_unfinished(folder)
+            (folder / RunFile.REPORT).unlink(missing_ok=True)  # it shows the part before the interruption
             self.pipeline.load_state_dict(checkpoint.state)
             _LOG.info("resumed after %d frames", checkpoint.frames)
             for warning in self.pipeline.record.warnings:
