@@ -436,13 +436,17 @@ def test_unwritable_tables_end_batch_after_running_jobs(
         (("--seqs", "fr3/w/xzy"), ("fr3/w/xyz",)),
         (("--seqs", "nothing_*"), ("nothing_*", "matches no sequence")),
         (("--resume",), ("--resume", "--out")),
+        (("--resume", "--out", "studdy"), ("studdy: is not a folder; pass the folder of the batch with --out",)),
+        (("--resume", "--out", "."), (".: has no runs of a batch; pass the folder of the batch with --out",)),
+        (("--out", ""), ("--out: is an empty path; give a path",)),
+        (("--data-root=",), ("--data-root: is an empty path; give a path",)),
     ],
 )
 def test_bad_input_is_one_line_before_first_run(
     arguments: tuple[str, ...], words: tuple[str, ...], moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    out = () if "--resume" in arguments else ("--out", tmp_path / "out")
+    out = () if {"--resume", "--out"} & set(arguments) else ("--out", tmp_path / "out")
     result = call("--seqs", moment, *arguments, *out)
     assert_error_line(result, *words)
     assert not list(tmp_path.iterdir())
