@@ -119,7 +119,8 @@ def test_a_single_keyframe_that_is_left_is_in_the_singular(tmp_path: Path) -> No
 
 
 def test_localise_without_map_is_rejected(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    assert_error_line(call_here("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
+    done = call_here("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path)
+    assert_error_line(done, "error: --localise: needs the map of an earlier run; add --load-map FILE\n")
     assert list(tmp_path.iterdir()) == []
 
 
