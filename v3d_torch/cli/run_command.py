@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sized
@@ -223,7 +224,7 @@ def _check_map_path(path: Path, out: Path | None, display: Display) -> None:
         OutputError: If it cannot, or if a recording of the run goes to the same file.
     """
     for option, recording in (("--bag", display.bag), ("--rerun", display.rerun_file)):
-        if recording is not None and recording.resolve() == path.resolve():
+        if recording is not None and os.path.realpath(recording) == os.path.realpath(path):
             raise OutputError(f"--save-map {path}: is also the file of {option}; choose another file for one of them")
     check_map_path(path, out)
     check_writable(path)
@@ -235,8 +236,8 @@ def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> No
     Raises:
         OutputError: If it would.
     """
-    written = [(folder / name).resolve() for name in (MASKS, MAP_MASKS)]
-    if masks is not None and masks.resolve() in written:
+    written = [os.path.realpath(folder / name) for name in (MASKS, MAP_MASKS)]  # also of a loop of links
+    if masks is not None and os.path.realpath(masks) in written:
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if not is_resumed:
         find_earlier_results(folder)

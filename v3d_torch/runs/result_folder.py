@@ -139,7 +139,7 @@ def find_earlier_results(folder: Path) -> list[Path]:
 
 def is_result(path: Path, folder: Path) -> bool:
     """Check whether a run writes a path in the folder of its results, or removes it as one of an earlier run."""
-    path, folder = path.resolve(), folder.resolve()
+    path, folder = Path(os.path.realpath(path)), Path(os.path.realpath(folder))  # also of a loop of links
     if not path.is_relative_to(folder):
         return False
     name = path.relative_to(folder).as_posix()
