@@ -33,6 +33,10 @@ class OutputError(V3DError):
     """A result cannot be written: no permission, or the disk is full."""
 
 
+class LockedError(OutputError):
+    """Another run or batch is writing to the folder of the results."""
+
+
 class GroundTruthWarning(UserWarning):
     """The ground truth of a sequence cannot be read. Its frames are available without true poses."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -34,15 +35,18 @@ def test_configuration_that_two_paths_name_is_loaded_once(tmp_path: Path, order:
 
 
 def test_configuration_without_map_is_rejected() -> None:
-    check_configs([load_config()])
+    check_configs(["full"], {"full": load_config()})
     with pytest.raises(ConfigError, match=r"^mapping\.enabled=false: there is no map to localise in; only `run` takes"):
-        check_configs([load_config(), load_config(overrides="mapping.enabled=false")])
+        check_configs(["full"], {"full": load_config(overrides="mapping.enabled=false")})
 
 
-def test_configuration_with_a_seed_is_rejected() -> None:
-    check_configs([load_config(overrides="seed=0")])
-    with pytest.raises(ConfigError, match=r"^seed=5: batch and ablate set the seeds 0, 1, \.\.\.; use --seeds$"):
-        check_configs([load_config(), load_config(overrides="seed=5")])
+def test_configuration_with_a_seed_is_rejected_by_its_file(tmp_path: Path) -> None:
+    check_configs(["full"], {"full": load_config(overrides="seed=0")})
+    mine = str(tmp_path / "mine.yaml")
+    Path(mine).write_text("seed: 5\n")
+    message = f"{mine}: has seed=5, but batch and ablate set the seeds 0, 1, ...; remove it, and use --seeds"
+    with pytest.raises(ConfigError, match=f"^{re.escape(message)}$"):
+        check_configs(["full", mine], load_configs(["full", mine], one_thread=False))
 
 
 def test_jobs_store_the_folder_of_the_variable_for_other_machines(

@@ -34,6 +34,7 @@ from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.cli.batch import app
 from v3d_torch.config.loading import load_config
 from v3d_torch.runs.result_folder import lock_results
+from v3d_torch.runtime.hangup import HANGUP
 
 BROKEN_AT = 3
 """Index of the damaged image."""
@@ -331,9 +332,9 @@ def test_incomplete_run_has_no_earlier_outcome(
 
 
 def interrupt(
-    arguments: Sequence[str | Path], when: Callable[[psutil.Process], bool]
+    arguments: Sequence[str | Path], when: Callable[[psutil.Process], bool], number: signal.Signals = signal.SIGINT
 ) -> subprocess.CompletedProcess[str]:
-    """Run the command and send Ctrl-C to all its processes, as a terminal does, when a condition holds.
+    """Run the command and send a signal to all its processes, as a terminal does, when a condition holds.
 
     The test fails if the command ends before, or if the condition does not hold within 100 seconds.
     """
@@ -352,7 +353,7 @@ def interrupt(
 
         try:
             wait_until(is_due, timeout=100, what="the condition of the interrupt")
-            os.killpg(process.pid, signal.SIGINT)
+            os.killpg(process.pid, number)
             stdout, stderr = process.communicate()
         except BaseException:
             os.killpg(process.pid, signal.SIGKILL)
@@ -361,13 +362,16 @@ def interrupt(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
-def test_ctrl_c_keeps_partial_results_and_resume_finishes(moment: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, *HANGUP])
+def test_signal_of_a_terminal_keeps_partial_results_and_resume_finishes(
+    number: signal.Signals, moment: Path, tmp_path: Path
+) -> None:
     sequence = repeat_sequence(moment, tmp_path / "long", ENDLESS)
     out = tmp_path / "out"
     arguments = ("--seqs", sequence, "--configs", "baseline", "--out", out)
     folder = out / "long" / "baseline" / "seed0"
     log = folder / "run.log"
-    done = interrupt(arguments, lambda _: log.is_file() and log.read_text().count(" frame ") >= 3)
+    done = interrupt(arguments, lambda _: log.is_file() and log.read_text().count(" frame ") >= 3, number)
     assert_error_line(done, "interrupted with 0 of 1 runs done", "--resume")
     assert "Traceback" not in done.stdout and "long, baseline, seed 0: failed: interrupted after" in done.stdout
     metrics = metrics_of(folder)
@@ -436,13 +440,17 @@ def test_unwritable_tables_end_batch_after_running_jobs(
         (("--seqs", "fr3/w/xzy"), ("fr3/w/xyz",)),
         (("--seqs", "nothing_*"), ("nothing_*", "matches no sequence")),
         (("--resume",), ("--resume", "--out")),
+        (("--resume", "--out", "studdy"), ("studdy: is not a folder; pass the folder of the batch with --out",)),
+        (("--resume", "--out", "."), (".: has no runs of a batch; pass the folder of the batch with --out",)),
+        (("--out", ""), ("--out: is an empty path; give a path",)),
+        (("--data-root=",), ("--data-root: is an empty path; give a path",)),
     ],
 )
 def test_bad_input_is_one_line_before_first_run(
     arguments: tuple[str, ...], words: tuple[str, ...], moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    out = () if "--resume" in arguments else ("--out", tmp_path / "out")
+    out = () if {"--resume", "--out"} & set(arguments) else ("--out", tmp_path / "out")
     result = call("--seqs", moment, *arguments, *out)
     assert_error_line(result, *words)
     assert not list(tmp_path.iterdir())

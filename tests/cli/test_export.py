@@ -247,6 +247,29 @@ def test_missing_file_is_an_error_and_nothing_is_written(file: str, words: str, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("format_", ["nerfstudio", "colmap"])
+def test_damaged_point_map_is_an_error_and_nothing_is_written(format_: str, results: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(results, tmp_path / "copy")
+    (copy / "map.ply").write_bytes((results / "map.ply").read_bytes()[:-1000])
+    done = call(copy, "--format", format_, "--out", tmp_path / "out")
+    assert_error_line(done, f"{copy / 'map.ply'}: is damaged or not a point map of a run")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("can_resume", [True, False])
+def test_run_that_ended_early_is_noted(can_resume: bool, results: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(results, tmp_path / "my run")
+    metrics = json.loads((results / "metrics.json").read_text())
+    metrics |= {"frames": 60, "failure": f"interrupted after {FRAMES} of 60 frames"}
+    (copy / "metrics.json").write_text(json.dumps(metrics))
+    if can_resume:
+        (copy / "checkpoint.v3d").touch()
+    done = call(copy, "--format", "tum", "--out", tmp_path / "out")
+    fix = f"; continue it with run --resume '{copy}'" if can_resume else ""
+    note = f"note: the run ended early, after {FRAMES} of 60 frames{fix}\n"
+    assert (done.exit_code, done.stdout) == (0, f"{FRAMES} images: {tmp_path / 'out'}\n{note}"), done.stderr
+
+
 def test_folder_in_a_suggested_command_is_quoted(results: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(results, tmp_path / "my run")
     (copy / "map.ply").unlink()
@@ -260,6 +283,8 @@ def test_unsuitable_options_and_folders_are_errors(results: Path, tmp_path: Path
     assert_error_line(done, "already exists and is not an empty folder; choose another folder with --out")
     done = call(results, "--format", "tum", "--out", tmp_path / "out", "--no-masks")
     assert_error_line(done, "--format tum: needs masks and the recorded images; remove --no-masks and --undistort")
+    for empty, name in (((results, "--out", ""), "--out"), (("", "--out", tmp_path / "out"), "an argument")):
+        assert_error_line(call("--format=tum", *empty), f"{name}: is an empty path; give a path")
     copy = tmp_path / "live"
     shutil.copytree(results, copy)
     (copy / "request.yaml").write_text(

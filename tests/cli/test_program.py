@@ -1,4 +1,4 @@
-"""Start of the program: Ctrl-C or SIGTERM while modules are imported."""
+"""Start of the program: Ctrl-C, SIGTERM or SIGHUP while modules are imported."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ CTRL_C = "raise KeyboardInterrupt"  # not a signal, which a process in the backg
 
 SIGTERM = "os.kill(os.getpid(), signal.SIGTERM)"
 
+SIGHUP = "os.kill(os.getpid(), signal.SIGHUP)"
+
 PROGRAM = "from v3d_torch.__main__ import main; main()"
 
 MODULE = "import runpy; runpy.run_module('v3d_torch.run', run_name='__main__', alter_sys=True)"
@@ -38,8 +40,15 @@ MODULE = "import runpy; runpy.run_module('v3d_torch.run', run_name='__main__', a
 )
 @pytest.mark.parametrize(
     ("module", "interrupt"),
-    [("typer", CTRL_C), ("rich.console", CTRL_C), ("torch", CTRL_C), ("typer", SIGTERM), ("torch", SIGTERM)],
-    ids=["typer", "rich", "torch", "typer, SIGTERM", "torch, SIGTERM"],
+    [
+        ("typer", CTRL_C),
+        ("rich.console", CTRL_C),
+        ("torch", CTRL_C),
+        ("typer", SIGTERM),
+        ("torch", SIGTERM),
+        ("torch", SIGHUP),
+    ],
+    ids=["typer", "rich", "torch", "typer, SIGTERM", "torch, SIGTERM", "torch, SIGHUP"],
 )
 def test_interruption_during_an_import_is_reported_as_later(
     module: str, interrupt: str, start: str, arguments: list[str]

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ import pytest
 import typer.main
 from helpers.bag_messages import read_with_mcap
 from helpers.batches import ENDLESS, repeat_sequence
-from helpers.commands import RUN_FILES, assert_error_line, call, call_here, environment, files_in
+from helpers.commands import RUN_FILES, assert_error_line, call, call_here, command, environment, files_in
 from helpers.corpus.outputs import at_frame
 from helpers.demo_frames import copy_frames
 from helpers.forked_command import call_forked, start_forked
@@ -367,6 +368,7 @@ def test_8_bit_depth_is_rejected(copy: Path, tmp_path: Path) -> None:
     ("file", "words"),
     [
         ("masks/1.0.png", "would be written while it is read"),
+        ("map_masks/1.0.png", "would be written while it is read"),
         ("map.ply", "exists and was not written by a run"),
     ],
 )
@@ -375,7 +377,7 @@ def test_unsuitable_result_folder_leaves_no_recording(file: str, words: str, seq
     path = tmp_path / "out" / file
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("")
-    masks = ("--segmenter", "masks", "--masks", "out/masks") if "masks" in file else ("--segmenter", "none")
+    masks = ("--segmenter", "masks", "--masks", path.parent) if "masks" in file else ("--segmenter", "none")
     done = call_here("--seq", sequence, *masks, "--out", "out", "--rerun", "run.rrd", cwd=tmp_path)
     assert_error_line(done, words)
     assert not (tmp_path / "run.rrd").exists()
@@ -426,6 +428,46 @@ def test_ctrl_c_keeps_partial_results(sequence: Path, tmp_path: Path) -> None:
     written = {name for name in files_in(out) if not name.startswith(("masks/", "map_masks/"))}
     # The figure of masks begins after a twelfth of the sequence.
     assert written | {"figures/masks.png"} == RUN_FILES | {"checkpoint.v3d"}
+
+
+IN_TERMINAL = (
+    "import fcntl, os, sys, termios; fcntl.ioctl(0, termios.TIOCSCTTY, 0); os.execv(sys.argv[1], sys.argv[1:])"
+)
+"""Code that makes the standard input the terminal of the process, which then runs a command."""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no terminals")
+def test_lost_terminal_keeps_partial_results(sequence: Path, tmp_path: Path) -> None:
+    """A dropped ssh session ends the run, which can no longer write to the terminal."""
+    endless, out = repeat_sequence(sequence, tmp_path / "endless", ENDLESS), tmp_path / "out"
+    arguments = command("--seq", endless, "--segmenter", "none", "--out", out)
+    master, slave = os.openpty()
+    os.set_blocking(master, False)
+    process = subprocess.Popen(  # noqa: S603
+        [sys.executable, "-c", IN_TERMINAL, *arguments],
+        **dict.fromkeys(("stdin", "stdout", "stderr"), slave),
+        env=environment(),
+        start_new_session=True,
+    )
+    os.close(slave)
+
+    def is_tracking() -> bool:
+        with suppress(BlockingIOError):
+            os.read(master, 1 << 16)  # else, a full terminal blocks the run
+        assert process.poll() is None
+        return (out / "run.log").is_file() and (out / "run.log").read_text().count(" frame ") >= 3
+
+    try:
+        wait_until(is_tracking, timeout=100, what="three frames are tracked")
+        os.close(master)
+        assert process.wait(timeout=100) == 2
+    finally:
+        process.kill()
+        process.wait()
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert 3 <= metrics["processed"] < ENDLESS and "interrupted after" in metrics["failure"]
+    assert len((out / "trajectory.txt").read_text().splitlines()) == metrics["processed"]
+    assert (out / "checkpoint.v3d").is_file() and "Traceback" not in (out / "run.log").read_text()
 
 
 def test_help_names_every_option() -> None:

@@ -27,14 +27,17 @@ from v3d_torch.cli import run, run_command
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.errors import OutputError
 from v3d_torch.io.state_file import VERSION
-from v3d_torch.mapping.map_io import load_map
+from v3d_torch.mapping.map_io import load_map, save_map
+from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.pipeline import ViewerGroup
 from v3d_torch.runs import results
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import read_request
+from v3d_torch.runs.result_folder import lock_results
 from v3d_torch.runs.stored_run import read_run
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -150,6 +153,12 @@ def test_interrupted_run_resumes_to_the_same_results(sequence: Path, whole_run: 
     assert_same_maps(tmp_path / "out", whole_run)
 
 
+def test_report_of_the_interrupted_run_is_removed_when_it_is_resumed(out: Path) -> None:
+    (out / RunFile.REPORT).write_text("interrupted")
+    done = call("--resume", out)
+    assert done.exit_code == 0 and not (out / RunFile.REPORT).exists(), done.stderr
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no file size limits")
 def test_temporarily_full_disk_only_prevents_checkpoints(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
     import resource
@@ -203,12 +212,28 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
     assert_same_maps(out, whole_run)
 
 
-def test_folder_in_the_way_to_resume_is_quoted(tmp_path: Path) -> None:
-    folder = tmp_path / "my run"
+def test_folder_in_the_way_to_resume_is_quoted(sequence: Path, tmp_path: Path) -> None:
+    folder, frames = tmp_path / "my run", load_sequence(str(sequence))
     folder.mkdir()
-    assert run_command._way_to_resume(folder) == ""
+    assert run_command._way_to_resume(folder, frames) == ""
     (folder / RunFile.CHECKPOINT).touch()
-    assert run_command._way_to_resume(folder) == f"; resume with --resume '{folder}'"
+    assert run_command._way_to_resume(folder, frames) == f"; resume with --resume '{folder}'"
+    assert run_command._way_to_resume(folder, RealtimePlayback(frames)) == ""  # its frames are gone
+
+
+def test_error_of_a_folder_that_becomes_locked_names_no_way_to_resume(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another run has begun between the check and the lock; the checkpoint is its own."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / RunFile.LOG).touch()
+    (out / RunFile.CHECKPOINT).touch()
+    monkeypatch.setattr(run_command, "check_unlocked", lambda folder: None)
+    with lock_results(out):
+        done = call(*run_arguments(sequence, out))
+    assert_error_line(done, f"{out}: another run or batch is writing to this folder")
+    assert "--resume" not in done.stderr
 
 
 def test_message_of_ctrl_c_while_results_are_written_names_the_way_to_resume(
@@ -242,18 +267,24 @@ def test_errors_of_results_and_recording_are_both_reported(
 # --- map files
 
 
+def write_earlier_map(path: Path, sequence: Path) -> Path:
+    config = Config()
+    save_map(path, SparseMap(config.mapping, config.features, load_sequence(str(sequence)).camera))
+    return path
+
+
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
 def test_interrupted_run_keeps_an_earlier_map_file_until_it_is_resumed(
     sequence: Path, whole_run: Path, tmp_path: Path
 ) -> None:
-    out, room = tmp_path / "out", tmp_path / "room.map"
-    room.write_bytes(b"the map of yesterday")
+    out, room = tmp_path / "out", write_earlier_map(tmp_path / "room.map", sequence)
+    yesterday = room.read_bytes()
     done = interrupt_run(sequence, out, 4, "--save-map", str(room))
     assert_error_line(done, f"interrupted after 5 of {FRAMES} frames", f"; resume with --resume {out})")
     beside = tmp_path / "room.partial.map"
     warning = f"warning: {room}: was not overwritten, because the run ended early; its map is saved to {beside}\n"
     assert warning in done.stdout
-    assert room.read_bytes() == b"the map of yesterday"
+    assert room.read_bytes() == yesterday
     assert load_map(beside, load_sequence(str(sequence)).camera, Config()).map.active_keyframes
     done = call("--resume", out)
     assert done.exit_code == 0 and "was not overwritten" not in done.stdout, done.stderr
@@ -267,8 +298,7 @@ def test_viewer_that_fails_after_the_last_frame_does_not_keep_the_map_from_being
     def fail(*_: object) -> None:
         raise OutputError("demo.rrd: cannot be written")
 
-    room = tmp_path / "room.map"
-    room.write_bytes(b"the map of yesterday")
+    room = write_earlier_map(tmp_path / "room.map", sequence)
     monkeypatch.setattr(ViewerGroup, "finish", fail)
     assert_error_line(call(*run_arguments(sequence, tmp_path / "out", "--save-map", str(room))), "demo.rrd: cannot be")
     assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
@@ -299,14 +329,27 @@ def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
     assert_same_maps(out, whole_run)
 
 
-@pytest.mark.parametrize("earlier", [b"the map of yesterday", None])
-def test_run_without_keyframes_writes_no_map_file(earlier: bytes | None, sequence: Path, tmp_path: Path) -> None:
+def test_file_put_in_place_of_the_map_during_the_run_stays(sequence: Path, whole_run: Path, tmp_path: Path) -> None:
+    out, room, beside = tmp_path / "out", tmp_path / "room.map", tmp_path / "room.partial.map"
+    beside.write_text("my own notes")
+    with at_frame(10, lambda: room.write_text("my notes")):
+        done = call(*run_arguments(sequence, out, "--save-masks", "--serial", "--save-map", str(room)))
+    assert_error_line(done, f"{room}: exists and is not a map", f"; resume with --resume {out})")
+    assert room.read_text() == "my notes" and (out / "map.ply").is_file()
+    room.unlink()
+    done = call("--resume", out)
+    assert done.exit_code == 0, done.stderr
+    assert room.read_bytes() == (whole_run.parent / "room.map").read_bytes()
+    assert beside.read_text() == "my own notes"
+
+
+@pytest.mark.parametrize("has_earlier", [True, False])
+def test_run_without_keyframes_writes_no_map_file(has_earlier: bool, sequence: Path, tmp_path: Path) -> None:
     dark, room = tmp_path / "dark", tmp_path / "room.map"
     shutil.copytree(sequence, dark)
     for path in (dark / "rgb").iterdir():
         path.write_bytes(base.png(np.zeros_like(cv2.imread(str(path)))))
-    if earlier is not None:
-        room.write_bytes(earlier)
+    earlier = write_earlier_map(room, sequence).read_bytes() if has_earlier else None
     done = call(*run_arguments(dark, tmp_path / "out", "--save-map", str(room)))
     assert_error_line(done, "the colour images are uniform")
     assert f"warning: {room}: was not written, because the map of this run has no keyframes\n" in done.stdout

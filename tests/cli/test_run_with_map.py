@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +119,8 @@ def test_a_single_keyframe_that_is_left_is_in_the_singular(tmp_path: Path) -> No
 
 
 def test_localise_without_map_is_rejected(halves: tuple[Path, Path], tmp_path: Path) -> None:
-    assert_error_line(call_here("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path), "--load-map")
+    done = call_here("--seq", halves[1], *OPTIONS, "--localise", cwd=tmp_path)
+    assert_error_line(done, "error: --localise: needs the map of an earlier run; add --load-map FILE\n")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -149,3 +151,40 @@ def test_unwritable_map_file_is_rejected_before_the_run(halves: tuple[Path, Path
     done = call_here("--seq", halves[0], *OPTIONS, "--save-map", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
     assert_error_line(done, f"{tmp_path}: cannot be written")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ("seq/groundtruth.txt", "exists and is not a map"),
+        ("out/metrics.json", "is a result of the run"),
+        ("out/masks/1.png", "is a result of the run"),
+        ("out/../out/run.log", "is a result of the run"),
+    ],
+)
+def test_map_replaces_neither_files_of_the_user_nor_results(
+    option: str, words: str, halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "seq").mkdir()
+    (tmp_path / "seq" / "groundtruth.txt").write_text("measured")
+    done = call_here("--seq", halves[0], *OPTIONS, "--save-map", option, "--out", "out", cwd=tmp_path)
+    assert_error_line(done, f"{option}: {words}", "choose another file with --save-map")
+    assert files_in(tmp_path) == {"seq/groundtruth.txt"}
+    assert (tmp_path / "seq" / "groundtruth.txt").read_text() == "measured"
+
+
+@pytest.mark.parametrize("option", ["--bag", "--rerun"])
+def test_map_and_recording_in_one_file_are_rejected(option: str, halves: tuple[Path, Path], tmp_path: Path) -> None:
+    done = call_here("--seq", halves[0], *OPTIONS, "--save-map", "a", option, tmp_path / "a", cwd=tmp_path)
+    assert_error_line(done, f"--save-map a: is also the file of {option}; choose another file")
+    assert files_in(tmp_path) == set()
+
+
+def test_map_of_an_earlier_run_is_replaced(halves: tuple[Path, Path], first: tuple[Path, Path], tmp_path: Path) -> None:
+    shutil.copy(first[1], tmp_path / "room.map")
+    done = call_here(
+        *("--seq", halves[1], *OPTIONS, "--load-map", "room.map", "--save-map", "room.map", "--out", "out"),
+        cwd=tmp_path,
+    )
+    assert done.exit_code == 0, done.stderr
+    assert (tmp_path / "room.map").read_bytes() != first[1].read_bytes()

@@ -64,13 +64,21 @@ def test_time_passes_at_the_frame_rate_also_where_depth_is_missing(root: Path) -
 
 def test_frame_rate_is_that_of_colour_if_depth_has_half_of_it(root: Path) -> None:
     fill(root, [f"rgb/{i:04d}.png" for i in range(20)], [f"depth/{i:04d}.png" for i in range(0, 20, 2)])
-    assert_frames(load_sequence(str(root), options=FPS), [i / 5 for i in range(10)], [(2 * i, i) for i in range(10)])
+    sequence = load_sequence(str(root), options=FPS)
+    assert_frames(sequence, [i / 5 for i in range(10)], [(2 * i, i) for i in range(10)])
+    assert isinstance(sequence, ImageFolder) and sequence.notes == [
+        "10 of 20 colour images have no depth image of the same name and are left out (the last is 0019.png)"
+    ]
 
 
 def test_images_with_timestamps_as_names_are_paired_by_time(root: Path) -> None:
     colour = [f"rgb/{t}.png" for t in ("1305031102.5", "1305031102.12", "1305031103.0")]
     fill(root, colour, [f"depth/{t}.png" for t in ("1305031102.51", "1305031102.11", "1305031109.0")])
-    assert_frames(load_sequence(str(root)), [1305031102.12, 1305031102.5], [(1, 1), (0, 0)])
+    sequence = load_sequence(str(root))
+    assert_frames(sequence, [1305031102.12, 1305031102.5], [(1, 1), (0, 0)])
+    assert isinstance(sequence, ImageFolder) and sequence.notes == [
+        "1 of 3 colour images have no depth image within 20 ms and are left out (the last at 1305031103.000000 s)"
+    ]
 
 
 def test_depth_delay_is_the_same_with_and_without_lists(root: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -44,7 +45,7 @@ def test_associations_with_spaces_in_file_names_are_read(
     path = tmp_path / "associations.txt"
     path.write_text("".join(f"{a!r} {colour} {b!r} {depth}\n" for a, colour, b, depth in entries))
     first = {entry[0]: (entry[0], entry[1], entry[3]) for entry in reversed(entries)}
-    found = [(pair.stamp, pair.colour, pair.depth) for pair in read_associations(path)]
+    found = [(pair.stamp, pair.colour, pair.depth) for pair in read_associations(path)[0]]
     assert found == [first[stamp] for stamp in sorted(first)]
 
 
@@ -55,9 +56,54 @@ def test_depth_delay_is_depth_stamp_minus_colour_stamp(tmp_path: Path) -> None:
     lines = ["10.0 rgb/a.png 9.984375 depth/a.png", "10.5 rgb/b.png 10.515625 depth/b.png"]
     path.write_text("\n".join(lines))
     listed, paired = read_associations(path), pair_lists(tmp_path / "rgb.txt", tmp_path / "depth.txt")
-    assert listed == paired and [pair.depth_delay for pair in listed] == [-1 / 64, 1 / 64]
+    assert listed == paired and listed[1] is None
+    assert [pair.depth_delay for pair in listed[0]] == [-1 / 64, 1 / 64]
     path.write_text("10.0 rgb/a.png 5009.99 depth/a.png")  # stamps of two clocks give no delay
-    assert [pair.depth_delay for pair in read_associations(path)] == [0.0]
+    pairs, note = read_associations(path)
+    assert [pair.depth_delay for pair in pairs] == [0.0]
+    assert note == (
+        f"{path}: the timestamps of 1 of 1 pairs are more than 20 ms apart (median of depth minus colour 4999.990 s);"
+        " colour and depth of these pairs count as simultaneous"
+    )
+
+
+def write_lists(folder: Path, colour: Iterable[float], depth: Iterable[float]) -> tuple[Path, Path]:
+    for kind, stamps in (("rgb", colour), ("depth", depth)):
+        (folder / f"{kind}.txt").write_text("".join(f"{stamp:.6f} {kind}/{stamp:.6f}.png\n" for stamp in stamps))
+    return folder / "rgb.txt", folder / "depth.txt"
+
+
+@pytest.mark.parametrize(
+    ("depth", "left_out", "last"),
+    [
+        (range(60), 0, 0.0),
+        (range(20), 40, 59 / 30),
+        (range(0, 60, 2), 30, 59 / 30),  # depth at half of the rate of colour
+        (range(10, 80), 10, 9 / 30),
+        ([*range(30), *range(33, 60)], 3, 32 / 30),
+    ],
+)
+def test_colour_images_without_depth_are_noted(
+    tmp_path: Path, depth: Iterable[int], left_out: int, last: float
+) -> None:
+    lists = write_lists(tmp_path, (i / 30 for i in range(60)), (i / 30 + 0.004 for i in depth))
+    pairs, note = pair_lists(*lists)
+    assert len(pairs) == 60 - left_out
+    words = (
+        f"{left_out} of 60 colour images have no depth image within 20 ms and are left out (the last at {last:.6f} s)"
+    )
+    assert note == (words if left_out else None)
+
+
+def test_lists_that_do_not_match_are_an_error(tmp_path: Path) -> None:
+    lists = write_lists(tmp_path, (i / 10 for i in range(60)), (i / 10.3 for i in range(60)))  # another clock
+    message = r"only \d+ of 60 colour and 60 depth images are within 20 ms of each other; check that both belong"
+    with pytest.raises(InputError, match=message):
+        pair_lists(*lists)
+
+
+def test_colour_at_a_lower_rate_than_depth_needs_no_note(tmp_path: Path) -> None:
+    assert pair_lists(*write_lists(tmp_path, range(10), (i / 10 for i in range(100))))[1] is None
 
 
 @pytest.mark.parametrize("written", ["rgb\\{}", "rgb/{}\u00a0", "rgb\u200b/{}", "\u00a0rgb\\{}\u200b"])
@@ -70,7 +116,7 @@ def test_backslashes_and_odd_spaces_in_file_names_are_understood(tmp_path: Path,
     assert read_image_list(tmp_path / "rgb.txt") == [(1.0, "rgb/a.png"), (2.0, "rgb/b c.png")]
     lines = f"1.0 {listed[0]} 1.01\u200b {listed[1]}\n"
     (tmp_path / "associations.txt").write_text(lines, encoding="utf-8")
-    (pair,) = read_associations(tmp_path / "associations.txt")
+    ((pair,), _) = read_associations(tmp_path / "associations.txt")
     assert (pair.colour, pair.depth, pair.depth_delay) == ("rgb/a.png", "rgb/b c.png", pytest.approx(0.01))
 
 

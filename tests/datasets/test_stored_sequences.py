@@ -418,4 +418,4 @@ def test_lists_of_fr1_rpy_give_the_pairs_of_its_associations(
     for name in ("rgb", "depth", "rgb.txt", "depth.txt"):
         (copy / name).symlink_to(source / name)
     assert load_sequence(str(copy)).stamps.tolist() == load_sequence(str(source)).stamps.tolist()
-    assert [pair.depth for pair in tum._read_pairs(copy)] == [pair.depth for pair in tum._read_pairs(source)]
+    assert [pair.depth for pair in tum._read_pairs(copy)[0]] == [pair.depth for pair in tum._read_pairs(source)[0]]

@@ -41,6 +41,8 @@ def test_frames_can_be_read_in_any_order(folder: Path, given: str, capfd: pytest
     assert isinstance(sequence, VideoSequence)
     assert sequence.name == ("rgb" if given else "take")
     assert sequence.stamps.tolist() == pytest.approx([0, 2 / 30, 4 / 30], abs=1e-6)
+    words = "3 of 6 colour images have no depth image within 20 ms and are left out (the last at 0.166667 s)"
+    assert sequence.notes == [words]
     for index in (0, 1, 1, 2, 0):
         assert_frame(sequence, index, 2 * index, index)
     with pytest.raises(IndexError):

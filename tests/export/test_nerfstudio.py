@@ -109,5 +109,6 @@ def test_distortion_model_that_nerfstudio_lacks_is_error(tmp_path: Path) -> None
 
 def test_folder_that_cannot_be_written_is_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
+    write_ply(tmp_path / "map.ply", POINTS, torch.from_numpy(COLOURS))
     with pytest.raises(OutputError, match=r"file.*: cannot be (made|written) "):
         write_nerfstudio(tmp_path / "file", CAMERA, posed_images(), tmp_path / "map.ply")

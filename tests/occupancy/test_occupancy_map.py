@@ -15,6 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
@@ -178,6 +179,24 @@ def test_ball_in_a_free_ball_is_free(
     occupancy, (small, large) = scattered[0], radii
     points = torch.tensor([point], dtype=torch.float64)
     assert not occupancy.is_free(points, large).item() or occupancy.is_free(points, small).item()
+
+
+@pytest.mark.parametrize("radius", [-0.1, torch.nan, torch.inf])
+def test_radius_that_is_negative_or_not_finite_is_an_input_error(radius: float, room: OccupancyMap) -> None:
+    with pytest.raises(InputError, match=rf"the radius of balls is {radius} m; give a finite radius of at least 0"):
+        room.is_free(room.free_points[:2], radius)
+
+
+@pytest.mark.parametrize("radius", [1e3, 1e5, 1e300])
+def test_ball_that_is_larger_than_the_map_is_not_free(
+    radius: float, room: OccupancyMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def visit(*_: object) -> None:
+        raise AssertionError("visits a voxel")
+
+    monkeypatch.setattr("v3d_torch.occupancy.occupancy_map.are_balls_free", visit)
+    assert room.is_free(room.free_points[:2].reshape(1, 2, 3), radius).tolist() == [[False, False]]
+    assert not OccupancyMap(CONFIG).is_free(torch.zeros(3), radius)
 
 
 # --- distances

@@ -9,6 +9,7 @@ import pytest
 from helpers.long_wall import CAMERA
 
 from v3d_torch.runs.interrupts import interrupts_between_frames
+from v3d_torch.runtime.hangup import HANGUP
 from v3d_torch.types import RGBDFrame
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="no SIGINT to itself")
@@ -38,7 +39,7 @@ def press_ctrl_c() -> None:
     os.kill(os.getpid(), signal.SIGINT)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, *HANGUP])
 def test_first_signal_ends_a_camera_that_sends_nothing(number: signal.Signals) -> None:
     camera = WaitingCamera()
     with interrupts_between_frames(camera) as interrupted:
@@ -79,8 +80,28 @@ def test_second_ctrl_c_interrupts_at_once() -> None:
             press_ctrl_c()
 
 
+def test_lost_terminal_that_is_reported_twice_does_not_interrupt_at_once() -> None:
+    with interrupts_between_frames() as interrupted:
+        for _ in range(2):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert interrupted.is_set()
+        with pytest.raises(KeyboardInterrupt):
+            press_ctrl_c()
+
+
+def test_lost_terminal_is_ignored_if_the_caller_ignores_it() -> None:
+    """``nohup`` does."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupts_between_frames() as interrupted:
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert not interrupted.is_set()
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
 def test_camera_is_not_stopped_without_ctrl_c() -> None:
-    camera, signals = WaitingCamera(), (signal.SIGINT, signal.SIGTERM)
+    camera, signals = WaitingCamera(), (signal.SIGINT, signal.SIGTERM, *HANGUP)
     before = list(map(signal.getsignal, signals))
     threads = set(threading.enumerate())
     with interrupts_between_frames(camera) as interrupted:

@@ -94,7 +94,7 @@ def run_ablation_study(
     """
     console = wide_console()
     variant_configs = {variant: load_config(_find_variant(variant), overrides) for variant in variants}
-    check_configs(variant_configs.values())
+    check_configs(variants, variant_configs)
     configs = {
         (variant, seed): config.model_copy(update={"seed": seed})
         for variant, config in variant_configs.items()

@@ -22,6 +22,7 @@ from v3d_torch.evaluation.summary import (
 from v3d_torch.evaluation.tables import ErrorTable
 from v3d_torch.io.files import write_text
 from v3d_torch.io.parquet_file import write_parquet
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
@@ -38,6 +39,9 @@ METRIC_TYPES: Mapping[str, pa.DataType] = {
 
 The name of a column is the key with ``_`` instead of the dots.
 """
+
+_TABLE = "runs.parquet"
+"""Name of the table of the runs."""
 
 _SCHEMA = pa.schema(
     [
@@ -67,7 +71,7 @@ class BatchRecord:
     def __init__(self, jobs: Sequence[Job], folder: Path) -> None:
         self.jobs = jobs
         self.folder = folder
-        self._table = folder / "runs.parquet"
+        self._table = folder / _TABLE
         self._outcomes = {job.folder: outcome for job in jobs if (outcome := job.earlier_outcome()) is not None}
 
     @property
@@ -129,6 +133,11 @@ class BatchRecord:
     def screen_tables(self) -> list[RenderableType]:
         """Return the summary as tables for the screen, and their explanations."""
         return make_screen_tables(self.outcomes)
+
+
+def has_batch(folder: Path) -> bool:
+    """Check whether a folder is that of a batch: it has the table of its runs from the start, or runs."""
+    return (folder / _TABLE).is_file() or next(folder.glob(f"*/*/seed*/{RunFile.LOG}"), None) is not None
 
 
 def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from v3d_torch.batch.job import Job, single_threaded
@@ -40,16 +40,24 @@ def load_configs(names: Sequence[str], *, one_thread: bool) -> dict[str, Config]
     return {label: single_threaded(config) for label, config in configs.items()} if one_thread else configs
 
 
-def check_configs(configs: Iterable[Config]) -> None:
+def check_configs(names: Sequence[str], configs: Mapping[str, Config]) -> None:
     """Check that configurations set no seed, which the batch sets, and need no inputs of a single run.
+
+    Args:
+        names: Names or files of the configurations, as given by the user.
+        configs: Configurations by their name in tables.
 
     Raises:
         ConfigError: If a configuration sets another seed than the default, or localises the camera in a map.
     """
-    for config in configs:
+    for name in names:
+        config = configs[find_config(name).stem]
         check_map_is_given(config)
         if config.seed != Config().seed:
-            raise ConfigError(f"seed={config.seed}: batch and ablate set the seeds 0, 1, ...; use --seeds")
+            raise ConfigError(
+                f"{name}: has seed={config.seed}, but batch and ablate set the seeds 0, 1, ...; remove it, and use"
+                " --seeds"
+            )
 
 
 def prepare_stages(configs: Mapping[str, Config]) -> None:

@@ -22,6 +22,7 @@ from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import remove_link
+from v3d_torch.runtime.hangup import HANGUP
 from v3d_torch.runtime.imports import import_environment
 
 if TYPE_CHECKING:
@@ -35,6 +36,9 @@ _MAX_SOCKET_PATH = 103
 
 _SOCKET_NAME = "/pymp-01234567/listener-01234567"
 """Form of the path of a fork server's socket in the temporary folder."""
+
+_OF_TERMINAL = (signal.SIGINT, *HANGUP)
+"""Signals that a terminal sends to all its processes."""
 
 _NO_LINKS: int = getattr(os, "O_NOFOLLOW", 0)
 """Flag of files that are opened without following a link; Windows has none."""
@@ -131,7 +135,8 @@ def _process_main(job: Job, connection: Connection, environment: Mapping[str, st
     """Run a job and send its progress and outcome; main function of the process."""
     os.environ.clear()  # the fork server has the environment of its start
     os.environ.update(environment)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # for systems on which `_block_interrupts` has no effect
+    for each in _OF_TERMINAL:
+        signal.signal(each, signal.SIG_IGN)  # for systems on which `_block_interrupts` has no effect
     _redirect_output(job.folder / RunFile.LOG)
 
     def report_progress(frames: int) -> None:
@@ -177,15 +182,15 @@ def _environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _block_interrupts() -> Iterator[None]:
-    """Block Ctrl-C for the processes that are started in the block; the parent asks them to stop instead.
+    """Block the signals of a terminal for the processes that are started in the block; the parent asks them to stop.
 
-    A terminal sends Ctrl-C to all its processes. Ctrl-C within the block takes effect after the block.
+    A terminal sends Ctrl-C, and its loss, to all its processes. A signal within the block takes effect after the block.
     """
     if sys.platform == "win32":
         yield
         return
     resource_tracker.ensure_running()  # if it started with the first process, it would unblock the signal
-    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, _OF_TERMINAL)
     try:
         yield
     finally:

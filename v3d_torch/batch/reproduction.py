@@ -66,7 +66,7 @@ def run_reproduction(
     one_thread = (workers or 1) > 1
     table_configs = load_configs(config_names, one_thread=one_thread)
     configs = load_configs([*config_names, *(ablation.VARIANTS if study else ())], one_thread=one_thread)
-    check_configs(configs.values())
+    check_configs(config_names, table_configs)
     opened, missing, reason = _open_paper_sequences(data_root, download, console)
     if missing:
         advice = describe_missing(missing, data_folder(data_root), reason)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from v3d_torch.batch.batch_record import BatchRecord
+from v3d_torch.batch.batch_record import BatchRecord, has_batch
 from v3d_torch.batch.executor import Executor, JobFinished, JobRepeated
 from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
@@ -22,7 +22,7 @@ from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import progress_bars
-from v3d_torch.runs.result_folder import lock_results, make_result_folder
+from v3d_torch.runs.result_folder import check_unlocked, lock_results, make_result_folder
 
 
 def run_batch(
@@ -46,7 +46,7 @@ def run_batch(
     check_resume(resume, out)
     console = wide_console()
     configs = load_configs(config_names, one_thread=ray is not None or (workers or 1) > 1)
-    check_configs(configs.values())
+    check_configs(config_names, configs)
     matches = matching_sequences(patterns, data_root)
     for note in matches.notes:
         print_line(console, f"note: {note}")
@@ -62,9 +62,20 @@ def run_batch(
 
 
 def check_resume(resume: bool, out: Path | None) -> None:
-    """Raise `InputError` if a batch is to be resumed and its folder is not given."""
-    if resume and out is None:
+    """Check that the folder of a batch that is to be resumed is given.
+
+    Raises:
+        InputError: If it is not given, or is not that of a batch.
+        LockedError: If another batch is writing to it, which may not have written its tables yet.
+    """
+    if not resume:
+        return
+    if out is None:
         raise InputError("--resume: no folder to resume; pass the folder of the batch with --out")
+    check_unlocked(out)
+    if not has_batch(out):
+        cause = "has no runs of a batch" if out.is_dir() else "is not a folder"
+        raise InputError(f"{out}: {cause}; pass the folder of the batch with --out, or start it without --resume")
 
 
 def run_missing_jobs(

@@ -88,6 +88,8 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
         out_camera, shown = undistort.camera, map(undistort, shown)
     with emptied_on_failure(out):  # else, the same command would reject the folder
         notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
+    if (note := _note_early_end(run)) is not None:
+        notes.append(note)
     if left_out := len(run.metrics.status) - len(localised_frames(run)):
         notes.append(f"{left_out} frames without a known pose are left out")
     print_line(console, f"{len(frames)} images: {out}")
@@ -148,11 +150,21 @@ _WRITERS = {"nerfstudio": _write_nerfstudio, "colmap": _write_colmap, "tum": _wr
 def _point_map(run: StoredRun) -> Path:
     path = run.folder / RunFile.MAP
     if not path.is_file():
-        raise InputError(
-            f"{path}: is missing, because the run did not end; continue it with run --resume"
-            f" {shlex.quote(str(run.folder))}"
-        )
+        raise InputError(f"{path}: is missing, because the run did not end; {_way_to_continue(run)}")
     return path
+
+
+def _note_early_end(run: StoredRun) -> str | None:
+    """Return a sentence on a run that ended before the end of its sequence; None for other runs."""
+    metrics = run.metrics
+    if metrics.failure is None or metrics.processed + metrics.skipped >= metrics.frames:
+        return None
+    fix = f"; {_way_to_continue(run)}" if (run.folder / RunFile.CHECKPOINT).is_file() else ""
+    return f"the run ended early, after {metrics.processed} of {metrics.frames} frames{fix}"
+
+
+def _way_to_continue(run: StoredRun) -> str:
+    return f"continue it with run --resume {shlex.quote(str(run.folder))}"
 
 
 def _read_tracks(export: _Export) -> tuple[LandmarkTracks, list[str]]:

@@ -1,4 +1,4 @@
-"""Report of Ctrl-C and SIGTERM; it imports nothing of the package, so that it is ready before slow imports."""
+"""Report of Ctrl-C, SIGTERM and SIGHUP; it imports nothing slow, so that it is ready before slow imports."""
 
 from __future__ import annotations
 
@@ -6,14 +6,27 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from types import FrameType
+
+from v3d_torch.runtime.hangup import handled_hangup, leave_terminal
 
 
 def interrupt_on_termination() -> None:
-    """Make SIGTERM, with which a system or a container ends its processes, raise the exception of Ctrl-C.
+    """Make SIGTERM and SIGHUP raise the exception of Ctrl-C.
 
-    A command then removes what it has half written, and reports the interruption.
+    A system or a container ends its processes with SIGTERM, and SIGHUP tells that the terminal is lost. A command then
+    removes what it has half written, and reports the interruption.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for each in handled_hangup():
+        signal.signal(each, _end_without_terminal)
+
+
+def _end_without_terminal(signum: int, frame: FrameType | None) -> None:
+    """Raise the exception of Ctrl-C once: the system and the shell both send SIGHUP."""
+    signal.signal(signum, signal.SIG_IGN)
+    leave_terminal()
+    raise KeyboardInterrupt
 
 
 @contextmanager

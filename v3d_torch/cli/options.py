@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from typer.core import TyperCommand
-from typer.models import OptionInfo
+from typer.models import CommandFunctionType, OptionInfo
+
+from v3d_torch.cli.errors import exit_on_error
+from v3d_torch.errors import InputError
+
+_PATHS = (Path, Path | None)
+"""Types of options that are paths."""
 
 DataRoot = Annotated[
     Path | None,
@@ -70,12 +77,48 @@ def workers_option(default: str) -> OptionInfo:
     return info
 
 
+class PathCommand(TyperCommand):
+    """Command that rejects empty paths: as a path, an empty text is the current folder."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the command line after checking its paths.
+
+        They are checked here because the values of options are paths without a trace of the empty text.
+        """
+        kinds = get_type_hints(self.callback)
+        paths = {name for option in self.params if kinds.get(str(option.name)) in _PATHS for name in option.opts}
+        for previous, argument in zip(["", *args], args, strict=False):
+            name, equals, value = argument.partition("=")
+            if not argument and previous in paths:
+                _reject_empty(previous)
+            if not argument and ("=" in previous or not previous.startswith("-")):
+                _reject_empty("an argument")
+            if equals and not value and name in paths:
+                _reject_empty(name)
+        return super().parse_args(ctx, args)
+
+
+def _reject_empty(name: str) -> None:
+    """Report a path that is empty, and exit."""
+    with exit_on_error():
+        raise InputError(f"{name}: is an empty path; give a path")
+
+
+class _Application(typer.Typer):
+    """Application whose commands are `PathCommand` by default."""
+
+    def command(
+        self, name: str | None = None, *, cls: type[TyperCommand] | None = PathCommand, **options: Any
+    ) -> Callable[[CommandFunctionType], CommandFunctionType]:
+        return super().command(name, cls=cls, **options)
+
+
 def make_app() -> typer.Typer:
     """Return the application of one command."""
-    return typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+    return _Application(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-class MultiValueCommand(TyperCommand):
+class MultiValueCommand(PathCommand):
     """Command whose repeatable options also accept several values, as in ``--configs paper full``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Start of the program, without slow imports, so that Ctrl-C and SIGTERM are reported from the first moment."""
+"""Start of the program, without slow imports, so that Ctrl-C, SIGTERM and SIGHUP are reported from the first moment."""
 
 from __future__ import annotations
 

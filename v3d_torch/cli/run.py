@@ -84,6 +84,7 @@ def main(
 
     with quick_imports():
         from v3d_torch.cli.run_command import ConfigChoice, Display, resume_run, start_run
+        from v3d_torch.errors import ConfigError
         from v3d_torch.runs.request import RunRequest
         from v3d_torch.segmentation.factory import check_network_is_used
 
@@ -100,6 +101,8 @@ def main(
     choice, display = ConfigChoice(config, tuple(set_ or ()), options), Display(viz, rerun, bag, profile)
     with exit_on_error():
         loaded = choice.load()
+        if localise and load_map is None and resume is None:
+            raise ConfigError("--localise: needs the map of an earlier run; add --load-map FILE")
         if model is not None:
             check_network_is_used(f"--model {model}", loaded)
         request = RunRequest(

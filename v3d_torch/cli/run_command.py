@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sized
@@ -14,10 +15,10 @@ from rich.table import Table
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
-from v3d_torch.datasets import RGBDStream, open_source
+from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
-from v3d_torch.errors import ConfigError, InputError, OutputError
+from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.evaluation import format_coverage, note_too_few_poses
 from v3d_torch.evaluation.outcome import label_sequence
@@ -27,7 +28,8 @@ from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
-from v3d_torch.runs.file_names import MASKS, RunFile
+from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
+from v3d_torch.runs.map_file import check_map_path
 from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
@@ -171,7 +173,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     """Open the inputs, run and print the summary."""
     console = Console(soft_wrap=True)
     if request.save_map is not None:
-        check_writable(Path(request.save_map))
+        _check_map_path(Path(request.save_map), out, display)
     masks = _path(request.masks)
     if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
         check_unlocked(out)
@@ -204,13 +206,28 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
             console,
             checkpoint,
         )
+    except LockedError:  # the checkpoint in the folder is that of the other run
+        raise
     except OutputError as error:
-        raise OutputError(f"{error}{_way_to_resume(folder)}") from error
+        raise OutputError(f"{error}{_way_to_resume(folder, sequence)}") from error
     except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
         raise InputError(
-            f"{folder}: interrupted before the results were written{_way_to_resume(folder)}"
+            f"{folder}: interrupted before the results were written{_way_to_resume(folder, sequence)}"
         ) from interrupt
     _print_summary(request, display, folder, pipeline, evaluation, console)
+
+
+def _check_map_path(path: Path, out: Path | None, display: Display) -> None:
+    """Check that a map can be saved to a path, see `check_map_path`.
+
+    Raises:
+        OutputError: If it cannot, or if a recording of the run goes to the same file.
+    """
+    for option, recording in (("--bag", display.bag), ("--rerun", display.rerun_file)):
+        if recording is not None and os.path.realpath(recording) == os.path.realpath(path):
+            raise OutputError(f"--save-map {path}: is also the file of {option}; choose another file for one of them")
+    check_map_path(path, out)
+    check_writable(path)
 
 
 def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> None:
@@ -219,7 +236,8 @@ def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> No
     Raises:
         OutputError: If it would.
     """
-    if masks is not None and masks.resolve() == (folder / MASKS).resolve():
+    written = [os.path.realpath(folder / name) for name in (MASKS, MAP_MASKS)]  # also of a loop of links
+    if masks is not None and os.path.realpath(masks) in written:
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if not is_resumed:
         find_earlier_results(folder)
@@ -274,16 +292,20 @@ def _print_summary(
         print_line(console, f"note: no checkpoint was saved, {record.save_error}")
     print_line(console, f"results: {folder}")
     if record.failure is not None:
-        frames = len(pipeline.slam.poses)
-        results = f"the results of the {frames} frames before are in {folder}{_way_to_resume(folder)}"
+        frames, fix = len(pipeline.slam.poses), _way_to_resume(folder, pipeline.sequence)
+        results = f"the results of the {frames} frames before are in {folder}{fix}"
         raise InputError(f"{record.failure} ({results})")
     if record.diagnosis is not None:
         raise InputError(f"{record.diagnosis} (the results are in {folder})")
 
 
-def _way_to_resume(folder: Path) -> str:
-    """Return the end of a message on a run that ended early: how to resume it; empty if it has no checkpoint."""
-    return f"; resume with --resume {shlex.quote(str(folder))}" if (folder / RunFile.CHECKPOINT).is_file() else ""
+def _way_to_resume(folder: Path, sequence: RGBDStream) -> str:
+    """Return the end of a message on a run that ended early: how to resume it.
+
+    It is empty if the run has no checkpoint, or that of a live stream, which contains no state.
+    """
+    can_resume = isinstance(sequence, RGBDSequence) and (folder / RunFile.CHECKPOINT).is_file()
+    return f"; resume with --resume {shlex.quote(str(folder))}" if can_resume else ""
 
 
 def _summary_table(

@@ -98,7 +98,7 @@ def _original_pairs(folder: Path) -> list[ImagePair]:
 def _listed_pairs(folder: Path) -> list[ImagePair]:
     return [
         ImagePair(pair.stamp / _RATE, pair.colour, pair.depth)
-        for pair in read_associations(folder / "associations.txt")
+        for pair in read_associations(folder / "associations.txt")[0]  # a note would give frames as seconds
     ]
 
 

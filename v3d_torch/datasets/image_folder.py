@@ -8,7 +8,14 @@ from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import list_images, stamp_in_name
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, ImagePair, check_stamp_unit, depth_delay
+from v3d_torch.datasets.lists import (
+    MAX_STAMP_DIFFERENCE,
+    MIN_PAIRED,
+    ImagePair,
+    check_paired,
+    check_stamp_unit,
+    depth_delay,
+)
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import associate
@@ -17,17 +24,13 @@ _COLOUR = re.compile(r"rgb|colou?r|image|img|photo", re.IGNORECASE)
 _DEPTH = re.compile(r"depth", re.IGNORECASE)
 _LEADING_ZEROS = re.compile(r"(?<!\d)0+(?=\d)")
 
-_MIN_PAIRED = 0.9
-"""Minimum fraction of the smaller list of images that is paired by name: cameras drop single images, but if more names
-differ, equal names are a coincidence."""
-
 
 class ImageFolder(PairedImages):
     """Sequence of images in two subfolders (``rgb`` and ``depth``), or of both kinds side by side in one folder.
 
     Colour and depth images are paired by the first rule that applies:
 
-    1. by nearest timestamps, if all names are timestamps;
+    1. by nearest timestamps, at most 20 ms apart, if all names are timestamps;
     2. by names that differ only in the kind, such as ``7_rgb.jpg`` and ``7_depth.png``, or also in leading zeros, such
        as ``rgb/7.png`` and ``depth/0007.png``; images without a partner are left out, of the kind with fewer images at
        most a tenth;
@@ -46,7 +49,7 @@ class ImageFolder(PairedImages):
 
     def __init__(self, folder: Path, camera: CameraChoice = None, *, fps: float | None = None) -> None:
         colour, depth = _find_images(folder)
-        files = _pair(folder, colour, depth)
+        files, note = _pair(folder, colour, depth)
         stamps = _stamps(folder, colour, [path for path, _ in files], fps)
         pairs = [
             ImagePair(
@@ -58,7 +61,7 @@ class ImageFolder(PairedImages):
         ]
         if fps is None:
             check_stamp_unit(pairs, folder)
-        super().__init__(folder, pairs, camera)
+        super().__init__(folder, pairs, camera, pairing_note=note)
 
 
 def is_image_folder(path: Path) -> bool:
@@ -94,26 +97,41 @@ def _images_side_by_side(folder: Path) -> tuple[list[Path], list[Path]]:
     return [path for path in images if _COLOUR.search(path.stem) and not _DEPTH.search(path.stem)], depth
 
 
-def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> list[tuple[Path, Path]]:
-    """Pair colour and depth images by the rules of `ImageFolder`."""
+def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> tuple[list[tuple[Path, Path]], str | None]:
+    """Pair colour and depth images by the rules of `ImageFolder`; also return a sentence on colour without depth."""
     colour_by_stamp, depth_by_stamp = _by_stamp(colour), _by_stamp(depth)
     if len(colour_by_stamp) == len(colour) and len(depth_by_stamp) == len(depth):
-        indices = associate(list(colour_by_stamp), list(depth_by_stamp), MAX_STAMP_DIFFERENCE)
+        stamps, depth_stamps = list(colour_by_stamp), list(depth_by_stamp)
+        indices = associate(stamps, depth_stamps, MAX_STAMP_DIFFERENCE)
         if not indices:
             raise InputError(
                 f"{folder}: no colour image is within {MAX_STAMP_DIFFERENCE} s of a depth image; check that both belong"
                 " to the same recording"
             )
-        return [(list(colour_by_stamp.values())[i], list(depth_by_stamp.values())[j]) for i, j in indices]
+        in_order, depth_in_order = list(colour_by_stamp.values()), list(depth_by_stamp.values())
+        note = check_paired(folder, stamps, depth_stamps, indices)
+        return [(in_order[i], depth_in_order[j]) for i, j in indices], note
     pairs = max((_pair_by_name(colour, depth, name) for name in (_without_kind, _without_zeros)), key=len)
-    if len(pairs) >= _MIN_PAIRED * min(len(colour), len(depth)):
-        return pairs
+    if len(pairs) >= MIN_PAIRED * min(len(colour), len(depth)):
+        return pairs, _note_unpaired_names(colour, pairs)
     if pairs or len(colour) != len(depth):
         raise InputError(
             f"{folder}: has {len(colour)} colour and {len(depth)} depth images, of which {len(pairs)} can be paired by"
             " name; give the two images of a frame the same name"
         )
-    return list(zip(colour, depth, strict=True))
+    return list(zip(colour, depth, strict=True)), None
+
+
+def _note_unpaired_names(colour: list[Path], pairs: list[tuple[Path, Path]]) -> str | None:
+    """Return a sentence on the colour images without a depth image of the same name; None if all have one."""
+    paired = {path for path, _ in pairs}
+    unpaired = [path for path in colour if path not in paired]
+    if not unpaired:
+        return None
+    return (
+        f"{len(unpaired)} of {len(colour)} colour images have no depth image of the same name and are left out (the"
+        f" last is {unpaired[-1].name})"
+    )
 
 
 def _pair_by_name(colour: list[Path], depth: list[Path], name: Callable[[Path], str]) -> list[tuple[Path, Path]]:

@@ -32,13 +32,17 @@ class ImageSequence(StoredSequence):
     depth_scale_note: str | None = None
     """Sentence that reports how the depth scale was estimated; None if it is stated."""
 
+    pairing_note: str | None = None
+    """Sentence on the pairing of colour and depth images, such as on images that are left out; None if there is nothing
+    to report."""
+
     registration_fix = "export depth that is registered to the colour image"
     """Fix for colour and depth of different sizes, for messages."""
 
     @property
     def notes(self) -> list[str]:
         """Sentences about the sequence that a user needs to know, such as how the depth scale was estimated."""
-        return [*super().notes, *([] if self.depth_scale_note is None else [self.depth_scale_note])]
+        return [*super().notes, *(note for note in (self.depth_scale_note, self.pairing_note) if note is not None)]
 
     def check(self, source: object, *, skip_broken: bool = False) -> None:
         """Check that all files exist, and decode the first frame, so that errors are reported before a long run.

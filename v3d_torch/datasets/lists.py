@@ -32,6 +32,13 @@ MAX_STAMP_DIFFERENCE = 0.02
 """Maximum difference between the timestamps of a colour and a depth image of one frame, seconds: the default of the
 TUM benchmark's association tool."""
 
+MIN_PAIRED = 0.9
+"""Minimum fraction of images that are paired, of the kind with fewer images: cameras drop single images, but if more
+have no partner, colour and depth do not belong together."""
+
+
+_LIMIT = f"{1000 * MAX_STAMP_DIFFERENCE:g} ms"
+
 
 @dataclass(frozen=True)
 class ImagePair:
@@ -76,7 +83,7 @@ def read_image_list(path: Path) -> list[tuple[float, str]]:
     return _sort_unique(entries, path)
 
 
-def read_associations(path: Path) -> list[ImagePair]:
+def read_associations(path: Path) -> tuple[list[ImagePair], str | None]:
     """Read a list with lines of ``stamp file stamp file``.
 
     Both orders are in use, colour first and depth first. The image headers of the first line with a colour and a depth
@@ -86,7 +93,8 @@ def read_associations(path: Path) -> list[ImagePair]:
         path: Path of the list, in the sequence's folder.
 
     Returns:
-        Pairs in the order of the colour timestamps.
+        Pairs in the order of the colour timestamps; and a sentence on pairs whose timestamps differ by more than 20 ms,
+        None if there are none.
 
     Raises:
         InputError: If the list cannot be read, is empty, or contains an invalid line.
@@ -114,13 +122,25 @@ def read_associations(path: Path) -> list[ImagePair]:
         ((stamp, (colour, depth, depth_stamp)) for stamp, colour, depth_stamp, depth in rows),
         path,
     )
-    return [
+    pairs = [
         ImagePair(stamp, colour, depth, depth_delay=depth_delay(stamp, depth_stamp))
         for stamp, (colour, depth, depth_stamp) in ordered
     ]
+    return pairs, _note_far_pairs(path, [depth_stamp - stamp for stamp, (_, _, depth_stamp) in ordered])
 
 
-def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
+def _note_far_pairs(path: Path, differences: Sequence[float]) -> str | None:
+    """Return a sentence on pairs whose timestamps (depth minus colour, seconds) differ much; None if there are none."""
+    far = [difference for difference in differences if abs(difference) > MAX_STAMP_DIFFERENCE]
+    if not far:
+        return None
+    return (
+        f"{path}: the timestamps of {len(far)} of {len(differences)} pairs are more than {_LIMIT} apart (median of"
+        f" depth minus colour {median(far):.3f} s); colour and depth of these pairs count as simultaneous"
+    )
+
+
+def pair_lists(colour: Path, depth: Path) -> tuple[list[ImagePair], str | None]:
     """Associate the images of two lists one to one by nearest timestamps, at most 20 ms apart.
 
     Args:
@@ -128,10 +148,10 @@ def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
         depth: Path of the list of depth images, in the same folder.
 
     Returns:
-        Pairs in the order of the colour timestamps.
+        Pairs in the order of the colour timestamps; and a sentence on colour images without depth, see `check_paired`.
 
     Raises:
-        InputError: If a list is missing or invalid (see `read_image_list`), or no timestamps match.
+        InputError: If a list is missing or invalid (see `read_image_list`), or too few timestamps match.
     """
     for path in (colour, depth):
         if not path.is_file():
@@ -139,15 +159,65 @@ def pair_lists(colour: Path, depth: Path) -> list[ImagePair]:
                 f"{path.parent}: has no {path.name}; list the images of the sequence in {colour.name} and {depth.name}"
             )
     images, depths = read_image_list(colour), read_image_list(depth)
-    indices = associate([stamp for stamp, _ in images], [stamp for stamp, _ in depths], MAX_STAMP_DIFFERENCE)
+    stamps, depth_stamps = [stamp for stamp, _ in images], [stamp for stamp, _ in depths]
+    indices = associate(stamps, depth_stamps, MAX_STAMP_DIFFERENCE)
     if not indices:
         raise InputError(
             f"{colour.parent}: no timestamp in {colour.name} is within {MAX_STAMP_DIFFERENCE} s of one in {depth.name};"
             " check that both lists belong to the same recording"
         )
-    return [
-        ImagePair(*images[i], depths[j][1], depth_delay=depth_delay(images[i][0], depths[j][0])) for i, j in indices
+    pairs = [
+        ImagePair(*images[i], depths[j][1], depth_delay=depth_delay(stamps[i], depth_stamps[j])) for i, j in indices
     ]
+    return pairs, check_paired(colour.parent, stamps, depth_stamps, indices)
+
+
+def check_paired(
+    source: object, colour: Sequence[float], depth: Sequence[float], pairs: Sequence[tuple[int, int]]
+) -> str | None:
+    """Check that colour and depth images that were paired by their timestamps belong together.
+
+    Images from before or after all images of the other kind do not count: a stream can start late or stop early. Nor do
+    colour images if depth has a lower rate.
+
+    Args:
+        source: Path of the sequence, for messages.
+        colour: Timestamps of the colour images, seconds, increasing.
+        depth: Timestamps of the depth images, seconds, increasing.
+        pairs: Result of `associate`, not empty.
+
+    Returns:
+        A sentence on colour images without depth, see `note_unpaired`.
+
+    Raises:
+        InputError: If less than `MIN_PAIRED` of the images are paired.
+    """
+    start = max(colour[0], depth[0]) - MAX_STAMP_DIFFERENCE
+    end = min(colour[-1], depth[-1]) + MAX_STAMP_DIFFERENCE
+    common = min(sum(start <= stamp <= end for stamp in stamps) for stamps in (colour, depth))
+    if len(pairs) < MIN_PAIRED * common:
+        raise InputError(
+            f"{source}: only {len(pairs)} of {len(colour)} colour and {len(depth)} depth images are within {_LIMIT} of"
+            " each other; check that both belong to the same recording, or list the pairs in associations.txt"
+        )
+    return note_unpaired(colour, pairs)
+
+
+def note_unpaired(colour: Sequence[float], pairs: Sequence[tuple[int, int]]) -> str | None:
+    """Return a sentence on the colour images that have no depth image within 20 ms; None if all have one.
+
+    Args:
+        colour: Timestamps of the colour images, seconds, increasing.
+        pairs: Result of `associate`.
+    """
+    paired = {index for index, _ in pairs}
+    unpaired = [stamp for index, stamp in enumerate(colour) if index not in paired]
+    if not unpaired:
+        return None
+    return (
+        f"{len(unpaired)} of {len(colour)} colour images have no depth image within {_LIMIT} and are left out (the last"
+        f" at {unpaired[-1]:.6f} s)"
+    )
 
 
 def depth_delay(colour: float, depth: float) -> float:

@@ -37,7 +37,7 @@ class OpenLORISSequence(PairedImages):
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
-        pairs = pair_lists(folder / "color.txt", folder / "aligned_depth.txt")
+        pairs, note = pair_lists(folder / "color.txt", folder / "aligned_depth.txt")
         groundtruth = folder / "groundtruth.txt"
         super().__init__(
             folder,
@@ -46,6 +46,7 @@ class OpenLORISSequence(PairedImages):
             lambda: _camera_poses(groundtruth, folder / "trans_matrix.yaml") if groundtruth.is_file() else None,
             published=lambda: _read_camera(folder / "sensors.yaml"),
             depth_scale=MILLIMETRES,
+            pairing_note=note,
         )
 
 

@@ -27,6 +27,7 @@ class PairedImages(ImageSequence):
         published: Function that gives the camera that the layout states (`choose_camera`); None if it states none.
         depth_scale: Depth units per metre that the layout prescribes; None if it does not prescribe them.
         name: Name used in tables; None for the folder's name.
+        pairing_note: Sentence on the pairing of the images; None if there is nothing to report.
 
     Raises:
         InputError: If there is no camera, or the unit of depth is not stated and cannot be estimated from the images.
@@ -42,6 +43,7 @@ class PairedImages(ImageSequence):
         published: PublishedCamera | None = None,
         depth_scale: float | None = None,
         name: str | None = None,
+        pairing_note: str | None = None,
     ) -> None:
         chosen = choose_camera(
             camera,
@@ -54,6 +56,7 @@ class PairedImages(ImageSequence):
         super().__init__(name or folder.resolve().name, stamps, chosen, groundtruth, delays)
         self.folder = folder
         self._pairs = pairs
+        self.pairing_note = pairing_note
         self._settle_depth_scale(folder)
 
     @staticmethod

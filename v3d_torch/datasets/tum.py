@@ -47,7 +47,7 @@ class TUMSequence(PairedImages):
         if not folder.is_dir():
             cause = "is not a folder" if folder.exists() else "does not exist"
             raise InputError(f"{folder}: {cause}; pass a folder with rgb.txt and depth.txt")
-        pairs = _read_pairs(folder)
+        pairs, note = _read_pairs(folder)
         check_stamp_unit(pairs, folder)
         groundtruth = folder / "groundtruth.txt"
         super().__init__(
@@ -57,6 +57,7 @@ class TUMSequence(PairedImages):
             lambda: read_trajectory(groundtruth) if groundtruth.is_file() else None,
             published=published,
             name=folder_label(folder.resolve().name) if name is None else name,
+            pairing_note=note,
         )
         if (gravity := folder / GRAVITY_FILE).is_file():
             self.gravity = read_gravity_file(gravity, float(self.stamps[0]))
@@ -84,7 +85,7 @@ class TUMSequence(PairedImages):
         return self._check_size(path, torch.from_numpy(ids).permute(2, 0, 1))[0]
 
 
-def _read_pairs(folder: Path) -> list[ImagePair]:
+def _read_pairs(folder: Path) -> tuple[list[ImagePair], str | None]:
     if (folder / "associations.txt").is_file():
         return read_associations(folder / "associations.txt")
     return pair_lists(folder / "rgb.txt", folder / "depth.txt")

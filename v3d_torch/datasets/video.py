@@ -18,7 +18,7 @@ from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
 from v3d_torch.datasets.image_sequence import ImageSequence
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, check_paired
 from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
@@ -76,12 +76,14 @@ class VideoSequence(ImageSequence):
                 f"{colour_path}: no frame is within {MAX_STAMP_DIFFERENCE} s of a frame in {depth_path.name}; check"
                 " that both videos belong to the same recording"
             )
+        pairing_note = check_paired(colour_path, stamps, depth_stamps, self._pairs)
         super().__init__(
             path_label(path),
             [stamps[i] for i, _ in self._pairs],
             chosen,
             delays=[depth_stamps[j] - stamps[i] for i, j in self._pairs],
         )
+        self.pairing_note = pairing_note
         self._colour_frames = Cursor(partial(_open_frames, colour_path))
         self._depth_frames = Cursor(partial(_open_frames, depth_path, is_depth=True))
         self._settle_depth_scale(path, _SAMPLED_FRAMES)

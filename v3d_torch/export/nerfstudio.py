@@ -17,6 +17,7 @@ from v3d_torch.export.posed_image import CORNER_OFFSET, PosedImage
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import SATURATED_DEPTH, depth_to_units
 from v3d_torch.io.files import atomic_write, write_png, write_text
+from v3d_torch.io.ply import read_ply_points
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,10 +40,12 @@ def write_nerfstudio(folder: Path, camera: PinholeCamera, images: Iterable[Posed
         points: PLY file with the static map, which is copied.
 
     Raises:
+        InputError: If the PLY file was not written by a run, or is damaged.
         ConfigError: If nerfstudio does not have the distortion model of the camera, ``rational_polynomial``.
         OutputError: If a file cannot be written.
     """
     lens = _lens(camera)
+    read_ply_points(points)  # an error before the images are written
     written = [_write_frame(folder, image) for image in images]
     if out_of_range := sum(count for _, count in written):
         _LOG.warning(

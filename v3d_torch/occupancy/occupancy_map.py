@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
+from v3d_torch.errors import InputError
 from v3d_torch.kernels.voxel_blocks import SIDE, UNKNOWN
 from v3d_torch.occupancy.clearance import NearestVoxels, are_balls_free, cube_gap
 from v3d_torch.occupancy.ray_casting import observe_voxels
@@ -135,7 +137,14 @@ class OccupancyMap:
         Returns:
             True if every voxel that a ball touches is free, bool, shape :math:`(...)`; false for centres that are not
             finite.
+
+        Raises:
+            InputError: If the radius is negative or not finite.
         """
+        if not (math.isfinite(radius) and radius >= 0):
+            raise InputError(f"the radius of balls is {radius} m; give a finite radius of at least 0")
+        if 2 * radius > self._smallest_extent():  # such a ball touches unknown space; its voxels could be too many
+            return torch.zeros(points.shape[:-1], dtype=torch.bool)
         rows = points.reshape(-1, 3).to(torch.float64)
         free = are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
         # Centres that are not finite, or too far away for integers, touch no voxel.
@@ -188,6 +197,14 @@ class OccupancyMap:
             self._nearest = NearestVoxels(self.occupied_points, self.config.max_distance)
         nearest, near = self._nearest(points.detach().reshape(-1, 3).to(torch.float64))
         return points.to(torch.float64) - nearest.reshape(points.shape), near.reshape(points.shape[:-1])
+
+    def _smallest_extent(self) -> float:
+        """Smallest side of the box around the stored blocks, metres; 0 without blocks."""
+        blocks = self.blocks.coordinates
+        if len(blocks) == 0:
+            return 0.0
+        sides = blocks.amax(dim=0) - blocks.amin(dim=0) + 1
+        return int(sides.min()) * SIDE * self.config.voxel_size
 
     def _voxels(self, points: Tensor) -> Tensor:
         """Coordinates of the voxels around points (..., 3), int64, (N, 3)."""

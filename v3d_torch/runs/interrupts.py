@@ -1,4 +1,4 @@
-"""Ctrl-C, or the signal to end a process, between two frames."""
+"""Ctrl-C, the signal to end a process, or the loss of the terminal, between two frames."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from threading import Event, Thread
 from types import FrameType
 
 from v3d_torch.datasets.base import LiveStream, RGBDStream
+from v3d_torch.runtime.hangup import HANGUP, handled_hangup, leave_terminal
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end a run: that of Ctrl-C, and that with which a system or a container ends its processes."""
+"""Signals that end a run, beside that of a lost terminal: that of Ctrl-C, and that with which a system or a container
+ends its processes."""
 
 _STOP_INTERVAL = 0.1
 """Interval at which a source is stopped after a signal, seconds."""
@@ -19,7 +21,9 @@ _STOP_INTERVAL = 0.1
 
 @contextmanager
 def interrupts_between_frames(source: RGBDStream | None = None) -> Iterator[Event]:
-    """Delay Ctrl-C and SIGTERM until the current frame is complete; a second one interrupts at once.
+    """Delay Ctrl-C, SIGTERM and SIGHUP until the current frame is complete; a second one interrupts at once.
+
+    SIGHUP, of a terminal that is lost, never interrupts at once: the system and the shell both send it.
 
     Args:
         source: Source of the frames. The signal also stops a `LiveStream`, because the next frame of a camera that was
@@ -34,12 +38,14 @@ def interrupts_between_frames(source: RGBDStream | None = None) -> Iterator[Even
     interrupted, is_over, woken = Event(), Event(), Event()
 
     def delay(signum: int, frame: FrameType | None) -> None:
-        if interrupted.is_set():
+        if signum in HANGUP:
+            leave_terminal()
+        elif interrupted.is_set():
             raise KeyboardInterrupt
         interrupted.set()
         woken.set()
 
-    previous = {each: signal.signal(each, delay) for each in _SIGNALS}
+    previous = {each: signal.signal(each, delay) for each in (*_SIGNALS, *handled_hangup())}
     try:
         if isinstance(source, LiveStream):
             # In a thread: the handler runs in the main thread, which can hold a lock that stop needs.

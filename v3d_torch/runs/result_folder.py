@@ -7,11 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from errno import ENOLCK, ENOSYS, EOPNOTSUPP
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from v3d_torch.errors import OutputError
+from v3d_torch.errors import LockedError, OutputError
 from v3d_torch.io.paths import folder_name
 from v3d_torch.runs.file_names import FIGURES, MAP_MASKS, MASKS, RunFile
 
@@ -79,7 +80,8 @@ def check_unlocked(folder: Path) -> None:
     """Check that no run or batch is writing to a folder, which can be missing.
 
     Raises:
-        OutputError: If another run or batch is writing to the folder, or if it cannot be made or written.
+        LockedError: If another run or batch is writing to the folder.
+        OutputError: If it cannot be made or written.
     """
     try:
         is_folder = folder.is_dir()
@@ -97,14 +99,15 @@ def lock_results(folder: Path) -> Iterator[None]:
     The lock of a process that is killed ends with it. On a file system without locks, nothing is locked.
 
     Raises:
-        OutputError: If another run or batch is writing to the folder, or if it cannot be written.
+        LockedError: If another run or batch is writing to the folder.
+        OutputError: If it cannot be written.
     """
     lock = FileLock(folder / _LOCK)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire(timeout=0)
     except Timeout as error:
-        raise OutputError(
+        raise LockedError(
             f"{folder}: another run or batch is writing to this folder; wait until it ends, or choose another folder"
             " with --out"
         ) from error
@@ -132,6 +135,15 @@ def find_earlier_results(folder: Path) -> list[Path]:
     if earlier and not (folder / RunFile.LOG).is_file():
         raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
     return earlier
+
+
+def is_result(path: Path, folder: Path) -> bool:
+    """Check whether a run writes a path in the folder of its results, or removes it as one of an earlier run."""
+    path, folder = Path(os.path.realpath(path)), Path(os.path.realpath(folder))  # also of a loop of links
+    if not path.is_relative_to(folder):
+        return False
+    name = path.relative_to(folder).as_posix()
+    return any(fnmatchcase(name, pattern) for pattern in (*_RESULTS, *_UNFINISHED, *_SUBFOLDERS, _LOCK, RunFile.LOG))
 
 
 def clear_earlier_results(folder: Path) -> None:

@@ -26,6 +26,7 @@ from v3d_torch.pipeline import FrameCallback, Pipeline, Viewer
 from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
+from v3d_torch.runs.map_file import check_map_path, is_map_file
 from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runs.system import make_system
@@ -94,6 +95,7 @@ class Run:
         )
         if checkpoint is not None:
             remove_unfinished(folder)
+            (folder / RunFile.REPORT).unlink(missing_ok=True)  # it shows the part before the interruption
             self.pipeline.load_state_dict(checkpoint.state)
             _LOG.info("resumed after %d frames", checkpoint.frames)
             for warning in self.pipeline.record.warnings:
@@ -173,8 +175,9 @@ class Run:
             target = beside
             pipeline.warn([f"{path}: was not overwritten, because the run ended early; its map is saved to {target}"])
         try:
+            check_map_path(target, self._folder)  # again: a file can have been put there during the run
             save_map(target, pipeline.slam.map, pipeline.views)
-            if is_whole and self._is_resumed:
+            if is_whole and self._is_resumed and is_map_file(beside):
                 beside.unlink(missing_ok=True)  # the map of the same run when it ended early
         except OutputError as error:  # the other results are written nevertheless
             if is_whole:

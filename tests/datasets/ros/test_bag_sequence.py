@@ -100,6 +100,7 @@ def test_decreasing_stamps_and_unpaired_images_are_dropped(tmp_path: Path) -> No
     assert sequence.stamps.tolist() == pytest.approx([*(10 + i / 10 for i in range(12)), 11.7])
     assert_frame(sequence, 12, 19)
     assert sequence.notes == [
+        "1 of 14 colour images have no depth image within 20 ms and are left out (the last at 11.600000 s)",
         f"{RGB}: the stamps jump back from 11.100000 to 10.050000 s after 12 images; 1 of 15 images are left out",
         f"{DEPTH}: the stamps jump back from 11.104000 to 10.050000 s after 12 images; 1 of 14 images are left out",
     ]
@@ -161,6 +162,24 @@ def test_camera_of_rectified_images_is_the_projection_matrix_without_distortion(
     messages = [(rectified if topic == RGB else topic, at, message) for topic, at, message in valid_messages(ROS2)]
     camera = load_sequence(str(ROS2.write(tmp_path / "take", messages))).camera
     assert camera == PinholeCamera(28, 29, 15, 11, WIDTH, HEIGHT, depth_scale=1000)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_camera_that_changes_within_a_bag_is_noted(kind: Kind, tmp_path: Path) -> None:
+    make = MessageFactory(kind)
+    messages = valid_messages(make)
+    for arrival, fx in ((10.55, 30.0), (10.65, 31.0)):
+        messages.append((INFO, arrival, make.info(WIDTH, HEIGHT, [fx, *K[1:]], D, P)))
+    path = make.write(tmp_path / "take", sorted(messages, key=lambda message: message[1]))
+    sequence = load_sequence(str(path))
+    assert isinstance(sequence, BagSequence) and sequence.camera.fx == 30 and len(sequence) == 3
+    assert sequence.notes == [
+        f"{path}: {INFO}: the camera changes at 10.650000 s (time of arrival), but all frames use the first one; cut"
+        " the bag there, or pass --camera if the change is wrong"
+    ]
+    (tmp_path / "camera.yaml").write_text(CAMERA_YAML)
+    given = load_sequence(str(path), camera=str(tmp_path / "camera.yaml"))
+    assert isinstance(given, BagSequence) and given.notes == []
 
 
 def test_distortion_models_are_read_or_rejected(tmp_path: Path) -> None:

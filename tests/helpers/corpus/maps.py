@@ -89,7 +89,7 @@ CASES = [
     Case(
         "--localise without a map",
         add_options("--localise"),
-        Fails("mapping.enabled=false: there is no map to localise in; only `run` takes one, with --load-map"),
+        Fails("--localise: needs the map of an earlier run; add --load-map FILE"),
     ),
     Case(
         "a missing file",

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.camera_fields import camera_from_fields
-from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cameras import CameraChoice, camera_file, choose_camera
 from v3d_torch.datasets.image_sequence import ImageSequence
-from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE
+from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, note_unpaired
 from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
@@ -77,7 +77,8 @@ class BagSequence(ImageSequence):
             depth_scale=MILLIMETRES,
             image_size=lambda: _image_size(path, topics),
         )
-        stamps, frame_ids, self._stamp_notes = _index_messages(path, topics, progress)
+        is_recorded = camera is None and camera_file(path) is None  # the camera is that of the CameraInfo
+        stamps, frame_ids, self._index_notes = _index_messages(path, topics, progress, with_info=is_recorded)
         depth_frame, colour_frame = frame_ids[topics.depth], frame_ids[topics.rgb]
         is_confirmed = depth_topic is not None or topics.is_registered
         if not is_confirmed and depth_frame and colour_frame and depth_frame != colour_frame:
@@ -98,6 +99,8 @@ class BagSequence(ImageSequence):
             chosen,
             delays=[depth_stamps[j] - colour_stamps[i] for i, j in pairs],
         )
+        # Never an error: the stamps are those of one recording, in which messages of both topics can be lost.
+        self.pairing_note = note_unpaired(colour_stamps, pairs)
         self._message_indices = [
             (stamps[topics.rgb][colour_stamps[i]], stamps[topics.depth][depth_stamps[j]]) for i, j in pairs
         ]
@@ -110,8 +113,8 @@ class BagSequence(ImageSequence):
 
     @property
     def notes(self) -> list[str]:
-        """Sentences about the sequence that a user needs to know, also on images that were left out."""
-        return [*super().notes, *self._stamp_notes]
+        """Sentences about the sequence that a user needs to know, also on images left out and a camera that changes."""
+        return [*super().notes, *self._index_notes]
 
     def _sources(self, index: int) -> tuple[str, str]:
         return f"{self.path}: {self.topics.rgb}", f"{self.path}: {self.topics.depth}"
@@ -189,18 +192,31 @@ def _read_messages(path: Path, *topics: str) -> Iterator[tuple[str, int, Any]]:
 
 
 def _index_messages(
-    path: Path, topics: BagTopics, progress: Progress | None
+    path: Path, topics: BagTopics, progress: Progress | None, *, with_info: bool
 ) -> tuple[dict[str, dict[float, int]], dict[str, str], list[str]]:
-    """Index the colour and depth messages of a bag.
+    """Index the colour and depth messages of a bag, and compare its CameraInfo messages.
+
+    Args:
+        path: Path of the bag.
+        topics: Topics.
+        progress: Called with the number of messages read so far.
+        with_info: True to compare the CameraInfo messages.
 
     Returns:
         For each topic, the message index by stamp (seconds, increasing); for each topic, its frame_id; and sentences on
-        images that were dropped, see `index_by_stamp`.
+        images that were dropped, see `index_by_stamp`, and on a camera that changes.
     """
     stamps: dict[str, list[float]] = {topics.rgb: [], topics.depth: []}
     arrivals: dict[str, list[float]] = {topic: [] for topic in stamps}
     frame_ids = dict.fromkeys(stamps, "")
-    for done, (topic, arrival, message) in enumerate(_read_messages(path, *stamps), start=1):
+    info = topics.info if with_info else None
+    read = [*stamps] if info is None else [*stamps, info]
+    cameras: list[tuple[float, dict[str, Any]]] = []  # the first one, and the first different one
+    for done, (topic, arrival, message) in enumerate(_read_messages(path, *read), start=1):
+        if topic == info:
+            if len(cameras) < 2 and (fields := _camera_fields(message, topics)) not in [known for _, known in cameras]:
+                cameras.append((arrival * 1e-9, fields))
+            continue
         stamp = message.header.stamp
         stamps[topic].append(stamp.sec + stamp.nanosec * 1e-9)
         arrivals[topic].append(arrival * 1e-9)
@@ -209,6 +225,8 @@ def _index_messages(
             progress(done, None)
     indexed = {topic: index_by_stamp(path, topic, stamps[topic], arrivals[topic]) for topic in stamps}
     notes = [note for _, note in indexed.values() if note is not None]
+    if len(cameras) > 1:
+        notes.append(_note_camera_change(path, topics, cameras[1][0]))
     return {topic: indices for topic, (indices, _) in indexed.items()}, frame_ids, notes
 
 
@@ -223,6 +241,19 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
         raise InputError(
             f"{path}: has no messages on {topics.info}; name another topic with --info-topic, or pass --camera"
         )
+    return camera_from_fields(_camera_fields(info, topics), f"{path}: {topics.info}")
+
+
+def _note_camera_change(path: Path, topics: BagTopics, arrival: float) -> str:
+    """Return a sentence on a camera that changes with the CameraInfo that arrived at this time, seconds."""
+    return (
+        f"{path}: {topics.info}: the camera changes at {arrival:.6f} s (time of arrival), but all frames use the first"
+        " one; cut the bag there, or pass --camera if the change is wrong"
+    )
+
+
+def _camera_fields(info: Any, topics: BagTopics) -> dict[str, Any]:
+    """Return the fields of a camera file of a CameraInfo message."""
     # ROS 1 has field names in upper case, ROS 2 in lower case.
     K, D, P = (getattr(info, name if hasattr(info, name) else name.lower()) for name in "KDP")
     rows = (np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)).tolist()
@@ -230,7 +261,7 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
     distortion, model = ([], "") if topics.is_rectified else (np.asarray(D).tolist(), info.distortion_model)
     size = {"width": info.width, "height": info.height, "depth_scale": MILLIMETRES}
     lens = {"distortion": distortion, "distortion_model": model}
-    return camera_from_fields(intrinsics | size | lens, f"{path}: {topics.info}")
+    return intrinsics | size | lens
 
 
 def _image_size(path: Path, topics: BagTopics) -> tuple[int, int]:
