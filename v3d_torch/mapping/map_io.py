@@ -25,7 +25,10 @@ from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import Readout
 
-_FORMAT, _VERSION = "v3d_torch map", 5
+MAP_FORMAT = "v3d_torch map"
+"""Format that a map file states."""
+
+_VERSION = 5
 
 _VERSION_WITHOUT_PARTS = 4
 """Version of files that do not tell the disconnected parts of a map apart; they are read as one part."""
@@ -66,7 +69,7 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
     """
     views = StaticViews(sparse_map.camera, stride=1) if views is None else views
     about = {
-        "format": _FORMAT,
+        "format": MAP_FORMAT,
         "version": _VERSION,
         "camera": asdict(sparse_map.camera),
         "readout": asdict(sparse_map.readout),
@@ -101,7 +104,7 @@ def load_map(path: StrPath, camera: PinholeCamera, config: Config) -> StoredMap:
     """
     path = Path(path)
     stored = StoredMap(SparseMap(config.mapping, config.features, camera), StaticViews(camera, config.dense_map.stride))
-    with open_array_file(path, _FORMAT, "a map file", _FIX) as file:
+    with open_array_file(path, MAP_FORMAT, "a map file", _FIX) as file:
         _check_compatibility(path, file.about, camera, config)
         stored.map.readout = Readout.from_dict(file.about["readout"])
         columns = _read_columns(file, to_columns(stored.map, stored.views))

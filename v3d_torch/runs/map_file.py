@@ -7,10 +7,8 @@ from pathlib import Path
 
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.io.array_file import open_array_file
+from v3d_torch.mapping.map_io import MAP_FORMAT
 from v3d_torch.runs.result_folder import is_result
-
-_FORMAT = "v3d_torch map"
-"""Format in the files of `v3d_torch.mapping.map_io.save_map`."""
 
 
 def is_map_file(path: Path) -> bool:
@@ -18,7 +16,7 @@ def is_map_file(path: Path) -> bool:
     try:
         if not path.is_file():  # opening a pipe would wait for its other end
             return False
-        with open_array_file(path, _FORMAT, "a map file", "give another file"):
+        with open_array_file(path, MAP_FORMAT, "a map file", "give another file"):
             return True
     except (InputError, OSError):  # OSError: such as of a name that is too long for a path
         return False
