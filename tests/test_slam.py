@@ -286,9 +286,9 @@ def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(
     T_dc = se3_exp(motions[-1].velocity * delay)
     assert torch.equal(result.T_dc, T_dc)
     assert float((T_dc - torch.eye(4)).abs().max()) > 1e-4  # the camera moves
-    torch.testing.assert_close(views[-1].T_cw, T_dc @ motions[-1].T_cp @ before)
+    torch.testing.assert_close(views[-1].T_dw, T_dc @ motions[-1].T_cp @ before)
     stored = slam.free_space_check.state_dict()["views"][-1]
-    torch.testing.assert_close(stored.T_cw, T_dc @ slam.poses.T_cw)
+    torch.testing.assert_close(stored.T_dw, T_dc @ slam.poses.T_cw)
     assert slam.occupancy is not None
     torch.testing.assert_close(slam.occupancy.state_dict()["store"]["T_dw"][-1], T_dc @ slam.poses.T_cw)
 
