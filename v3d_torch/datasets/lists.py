@@ -36,7 +36,6 @@ MIN_PAIRED = 0.9
 """Minimum fraction of images that are paired, of the kind with fewer images: cameras drop single images, but if more
 have no partner, colour and depth do not belong together."""
 
-
 _LIMIT = f"{1000 * MAX_STAMP_DIFFERENCE:g} ms"
 
 

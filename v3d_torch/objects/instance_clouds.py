@@ -32,8 +32,7 @@ class InstanceClouds:
     Attributes:
         points: Voxel means of the masked pixels, outliers included, camera frame, metres, float32, shape
             :math:`(N, P, 3)`.
-        valid: Mask of the points of the object, bool, shape :math:`(N, P)`; False for outliers and
-            padding.
+        valid: Mask of the points of the object, bool, shape :math:`(N, P)`; False for outliers and padding.
         centroid: Mean of the points, float32, shape :math:`(N, 3)`; NaN if a cloud has too few points.
         cloud_pixels: Pixels of each mask whose point belongs to the cloud, bool, shape :math:`(N, H, W)`.
     """
@@ -107,17 +106,17 @@ def _compute_clouds(depth: Tensor, masks: Tensor, rays: NDArray[np.float32], con
 
 def _select_object(points: Tensor, labels: Tensor, valid: Tensor) -> Tensor:
     """Select the points (N, P) of the largest cluster of each cloud and of the other parts of the object."""
-    largest, cluster = largest_clusters(labels, valid, 1), labels.clamp(min=0)
+    largest = largest_clusters(labels, valid, 1)
     if labels.numel() == 0:
         return largest
-    clustered = (valid & (labels >= 0)).to(torch.float64)
-    nothing = torch.zeros_like(clustered)
-    size = nothing.scatter_add(1, cluster, clustered)
-    depth = nothing.scatter_add(1, cluster, points[..., 2] * clustered) / size
+    clustered, cluster = valid & (labels >= 0), labels.clamp(min=0)
+    nothing = torch.zeros(labels.shape, dtype=torch.float64)
+    size = nothing.scatter_add(1, cluster, clustered.to(torch.float64))
+    depth = nothing.scatter_add(1, cluster, points[..., 2] * clustered.to(torch.float64)) / size
     of_largest = torch.where(largest, cluster, 0).amax(dim=1, keepdim=True)
     is_part = (depth - depth.gather(1, of_largest)).abs() <= kernels.MAX_PART_OFFSET
     is_part &= size >= kernels.MIN_PART_SIZE * size.gather(1, of_largest)
-    return (clustered > 0) & is_part.gather(1, cluster)
+    return clustered & is_part.gather(1, cluster)
 
 
 def _with_centroids(points: Tensor, valid: Tensor, cloud_pixels: Tensor, min_points: int) -> InstanceClouds:

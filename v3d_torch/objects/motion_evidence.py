@@ -15,7 +15,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.free_space_check import vacated_fractions
 from v3d_torch.objects.intra_object_motion import intra_object_motion
-from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.newly_occupied import MIN_REGION_SIDE, NewlyOccupied
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.objects.voting import vote_with_free_space
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
@@ -27,9 +27,6 @@ affect only a part of a static object."""
 DEFORMED_FRACTION = 0.1
 """Minimum fraction of the visible points of a deformed object that appeared or vacated. The error of silhouettes is one
 or two pixels, some hundredths of a person; a torso of 0.4 m that sways by 4 cm reaches this fraction."""
-
-_MIN_REGION_PIXELS = 9
-"""Minimum number of known coarse pixels of an unlabelled region: the smallest that `unlabelled_instances` proposes."""
 
 DetectionPairs = dict[Track, tuple[Detection3D, Detection3D]]
 """Earlier and newest detection of each object for which both exist."""
@@ -110,7 +107,7 @@ def free_space_evidence(
     # coarse. What cannot move by itself has moved only if most of it is known to have appeared.
     of_all = [track.label in RIGID for track in tracks]
     # A far unlabelled region is smaller than other objects, but each of its pixels was new when it was proposed.
-    least = min(config.min_points, _MIN_REGION_PIXELS)
+    least = min(config.min_points, MIN_REGION_SIDE**2)
     min_pixels = [least if track.label == UNLABELLED else config.min_points for track in tracks]
     appeared = newly_occupied.fractions([track.cloud_pixels for track in tracks], min_pixels, of_all)
     previous = list(dict.fromkeys(earlier for of_time_span in pairs.values() for earlier, _ in of_time_span.values()))

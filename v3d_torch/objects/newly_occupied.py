@@ -11,6 +11,10 @@ from torch import Tensor
 
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 
+MIN_REGION_SIDE = 3
+"""Side of the smallest square of newly occupied pixels that is a region: fewer are depth noise. Pixels of
+`NewlyOccupied`."""
+
 
 @dataclass(frozen=True)
 class NewlyOccupied:

@@ -17,11 +17,11 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.objects.mask_ops import subsample, upsample_nearest
 from v3d_torch.objects.motion_evidence import MOVED_FRACTION
-from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.newly_occupied import MIN_REGION_SIDE, NewlyOccupied
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 from v3d_torch.types import Instances
 
-_OPENING_KERNEL = np.ones((3, 3), np.uint8)
+_OPENING_KERNEL = np.ones((MIN_REGION_SIDE, MIN_REGION_SIDE), np.uint8)
 """Isolated newly occupied pixels are depth noise; opening by this kernel removes them (pixels of `NewlyOccupied`)."""
 
 _RIM_KERNEL = np.ones((5, 5), np.uint8)
