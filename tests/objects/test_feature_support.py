@@ -48,10 +48,22 @@ def test_object_over_the_whole_image_is_compared_with_the_usual_inlier_ratio(rat
     assert support.supports(support.on_objects(everything)).tolist() == [supported]
 
 
+@pytest.mark.parametrize(
+    ("fitting", "outside", "count", "has_most"),
+    [(0.51, 0.5, 100, True), (0.5, 0.5, 100, False), (1.0, 0.0, 10, True), (1.0, 0.0, 9, False), (0.0, 0.0, 9, False)],
+)
+def test_object_has_most_inliers_if_more_than_half_are_on_it(
+    fitting: float, outside: float, count: int, has_most: bool
+) -> None:
+    support, mask = scene(fitting, outside, count)
+    assert support.have_most_inliers(support.on_objects(mask)).tolist() == [has_most]
+
+
 def test_no_features_and_no_objects_are_accepted() -> None:
     no_features = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
     everything = torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool)
     assert no_features.supports(no_features.on_objects(everything)).tolist() == [False, False]
+    assert no_features.have_most_inliers(no_features.on_objects(everything)).tolist() == [False, False]
     support, _ = scene(0.5)
     assert support.supports(support.on_objects(everything[:0])).shape == (0,)
 

@@ -476,6 +476,32 @@ def test_thing_whose_features_shift_is_dynamic_until_they_have_not_for_a_second(
     assert [frame for frame in range(50) if dynamic[frame]] == list(expected)
 
 
+@pytest.mark.parametrize(
+    ("label", "share", "motion_state"),
+    [(60, 0.6, MotionState.STATIC), (60, 0.4, MotionState.DYNAMIC), (PERSON, 0.6, MotionState.DYNAMIC)],
+    ids=["table", "table with few features", "person"],
+)
+def test_thing_with_most_inliers_of_the_camera_motion_is_static(
+    label: int, share: float, motion_state: MotionState
+) -> None:
+    """The depth shows a motion of the object. The camera motion, measured from its features, shows none."""
+    features = torch.cartesian_prod(torch.arange(2, CAMERA.width, 5), torch.arange(2, CAMERA.height, 5))
+    mask = torch.zeros(1, CAMERA.height, CAMERA.width, dtype=torch.bool)
+    mask[:, 30:90, 50:110] = True
+    thing = Instances(mask, torch.tensor([label]), torch.tensor([0.9]), torch.zeros(1, 4))
+    on_thing = mask[0, features[:, 1], features[:, 0]]
+    others = (~on_thing).nonzero()[:, 0][: round(int(on_thing.sum()) * (1 - share) / share)]
+    fits = on_thing.clone()
+    fits[others] = True
+    stage = ObjectStage(ObjectsConfig())
+    stage.feature_support = FeatureSupport(features, fits)
+    for frame in range(40):
+        depth = torch.full((1, CAMERA.height, CAMERA.width), 3.0)
+        depth[mask] = 2.0 - 0.02 * frame
+        (obj,) = stage(frame / 30, thing, depth, HERE).objects
+    assert obj.motion_state is motion_state
+
+
 def test_thing_is_static_although_something_in_its_mask_moves() -> None:
     """The mask of a table contains an arm before it, on which most of its features are."""
     depth = torch.full((1, CAMERA.height, CAMERA.width), 2.0)

@@ -75,6 +75,20 @@ class FeatureSupport:
         counts, features = (on_objects & self.inliers).sum(dim=1), on_objects.sum(dim=1)
         return (counts >= _MIN_SUPPORTING_FEATURES) & (counts >= _MIN_SUPPORT_RATIO * outside_ratio * features)
 
+    def have_most_inliers(self, on_objects: Tensor) -> Tensor:
+        """Find the objects on which most of the features are that fit the camera motion.
+
+        The motion was measured mainly from them, so that it shows no motion of the object itself.
+
+        Args:
+            on_objects: Features of each of K objects, see `on_objects`.
+
+        Returns:
+            Mask of these objects, bool, shape :math:`(K,)`.
+        """
+        counts = (on_objects & self.inliers).sum(dim=1)
+        return (counts >= _MIN_SUPPORTING_FEATURES) & (2 * counts > self.inliers.sum())
+
     def shifts(self, on_objects: Tensor, size: Sequence[int]) -> list[FeatureShift | None]:
         """Measure how far the features on objects move together, see `feature_shifts`; None if this is not known.
 

@@ -107,7 +107,9 @@ class MotionClassifier:
         # A mask can contain other objects: the arms of people who sit at a table are in the mask of the table.
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
         shifted = self._shifted_tracks(tracks, feature_support, on_objects, view)
-        for track in vote.dynamic | shifted:
+        # The camera motion is relative to what has most of the features, such as a table that fills the image.
+        references = self._rigid_references(tracks, feature_support.have_most_inliers(on_objects))
+        for track in (vote.dynamic | shifted) - references:
             track.mark_dynamic(stamp)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
@@ -216,6 +218,11 @@ class MotionClassifier:
         for track, shift in zip(tracks, feature_support.shifts(on_objects, view.missing.shape), strict=True):
             track.add_shift(view.stamp, shift, config.time_span)
         return {track for track in tracks if track.last_shifted == view.stamp}
+
+    def _rigid_references(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
+        """Return the rigid objects that have most of the inliers: people move some of their parts, and not others."""
+        flags = zip(tracks, have_most_inliers.tolist(), strict=True)
+        return {track for track, has_most in flags if has_most and track.label in RIGID and not track.may_be_living}
 
     def _motion_state(self, track: Track, appeared: list[float], stamp: float) -> MotionState:
         """Return the motion state of an object.
