@@ -22,7 +22,7 @@ from v3d_torch.config import Config
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.ate import RotationSource, absolute_errors, align, scale_error
 from v3d_torch.features.features import Features
-from v3d_torch.features.ransac import epipolar_inliers
+from v3d_torch.features.fundamental_ransac import epipolar_inliers
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.geometry.se3 import invert, orthonormalise, se3_exp, se3_log

@@ -11,7 +11,7 @@ from .evaluation.rpe import RelativePoseError, rpe
 from .evaluation.umeyama import umeyama
 from .features.essential import EssentialMatrix, EssentialRANSAC, essential_ransac
 from .features.matching import DescriptorMatcher, match_descriptors
-from .features.ransac import PnP, PnPRANSAC, pnp_ransac
+from .features.pnp_ransac import PnP, PnPRANSAC, pnp_ransac
 from .frame_result import FrameResult
 from .geometry.camera import BackProjector, PinholeCamera, back_project
 from .geometry.depth_smoother import DepthSmoother, smooth_depth

@@ -24,7 +24,7 @@ from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import batch, run
-from v3d_torch.datasets.stored import max_broken_frames
+from v3d_torch.datasets.broken_frames import max_broken_frames
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 

@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from v3d_torch.datasets.stored import Cursor
+from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.errors import InputError
 
 

@@ -33,7 +33,7 @@ ITERATIONS = 1
 """Iterations of solvers, for the same reason."""
 
 FEW_ITERATIONS = (
-    patch("v3d_torch.features.ransac.refine_pose", partial(refine_pose, iterations=ITERATIONS)),
+    patch("v3d_torch.features.pnp_ransac.refine_pose", partial(refine_pose, iterations=ITERATIONS)),
     patch("v3d_torch.features.sampson._ROUNDS", 1),
     patch("v3d_torch.features.sampson._ITERATIONS", ITERATIONS),
     patch("v3d_torch.features.p3p._ROOT_ITERATIONS", ITERATIONS),

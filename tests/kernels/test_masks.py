@@ -21,7 +21,7 @@ SIZES = [(1, 1), (1, 7), (9, 1), (13, 30), (48, 64)]
 @pytest.mark.parametrize("density", [0.0, 0.02, 0.5, 1.0])
 @pytest.mark.parametrize("radius", [0, 1, 3, 8, 100])
 def test_dilation_equals_its_twin(size: tuple[int, int], density: float, radius: int) -> None:
-    twin = TWINS["v3d_torch.objects.mask_ops.dilate"]
+    twin = TWINS["v3d_torch.objects.dilation.dilate"]
     mask = torch.from_numpy(np.random.default_rng(0).random(size) < density)
     assert torch.equal(twin.compiled(mask, radius), twin.torch(mask, radius))
 

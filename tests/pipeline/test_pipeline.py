@@ -23,9 +23,9 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.datasets.broken_frames import max_broken_frames
 from v3d_torch.datasets.readable_frames import BrokenFrame
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
-from v3d_torch.datasets.stored import max_broken_frames
 from v3d_torch.errors import InputError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.mapping.static_views import StaticViews

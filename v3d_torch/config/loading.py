@@ -18,7 +18,7 @@ from v3d_torch.config.validation import first_error
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.io.paths import StrPath, expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
-from v3d_torch.io.text import read_text, replace_odd_spaces
+from v3d_torch.io.text_file import read_text, replace_odd_spaces
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""

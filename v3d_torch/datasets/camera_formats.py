@@ -11,7 +11,7 @@ from typing import Any
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.distortion import COEFFICIENTS, DistortionModel
-from v3d_torch.io.text import replace_odd_spaces
+from v3d_torch.io.text_file import replace_odd_spaces
 
 Fields = dict[str, Any]
 

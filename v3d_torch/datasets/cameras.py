@@ -18,7 +18,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text_file import read_text
 
 _PRESETS = resources.files("v3d_torch.datasets") / "presets"
 PRESETS: tuple[str, ...] = tuple(

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
-from v3d_torch.io.text import numbered_lines, replace_odd_spaces
+from v3d_torch.io.text_file import numbered_lines, replace_odd_spaces
 from v3d_torch.io.timestamps import parse_timestamp
 
 _LOG = logging.getLogger(__name__)

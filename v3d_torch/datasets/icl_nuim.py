@@ -15,7 +15,7 @@ from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text_file import read_text
 from v3d_torch.types import Trajectory
 
 CAMERA = PinholeCamera(481.2, 480.0, 319.5, 239.5, depth_scale=5000.0, readout=0.0)

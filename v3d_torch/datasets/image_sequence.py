@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from v3d_torch.datasets.stored import StoredSequence, max_broken_frames
+from v3d_torch.datasets.broken_frames import max_broken_frames
+from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.depth_scale import estimate_depth_scale
 from v3d_torch.geometry.depth_units import depth_to_metres, implausible_median

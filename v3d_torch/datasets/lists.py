@@ -14,7 +14,7 @@ from typing import TypeVar
 
 from v3d_torch.datasets.depth_files import is_depth_file
 from v3d_torch.errors import InputError
-from v3d_torch.io.text import numbered_lines, replace_odd_spaces
+from v3d_torch.io.text_file import numbered_lines, replace_odd_spaces
 from v3d_torch.io.timestamps import associate, parse_timestamp
 
 _T = TypeVar("_T")

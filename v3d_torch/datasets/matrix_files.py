@@ -15,7 +15,7 @@ from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE, ROTATION_TOLERANCE
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
-from v3d_torch.io.text import numbered_lines, read_text, replace_odd_spaces
+from v3d_torch.io.text_file import numbered_lines, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
 
 

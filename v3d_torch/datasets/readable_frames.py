@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from v3d_torch.datasets.stored import max_broken_frames
+from v3d_torch.datasets.broken_frames import max_broken_frames
 from v3d_torch.errors import InputError
 from v3d_torch.types import RGBDFrame
 

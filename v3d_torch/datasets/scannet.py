@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.datasets.broken_frames import first_readable
 from v3d_torch.datasets.camera_fields import camera_from_fields, check_principal_point
 from v3d_torch.datasets.cameras import CameraChoice, camera_file
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
@@ -18,7 +19,6 @@ from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.paired_images import PairedImages
-from v3d_torch.datasets.stored import first_readable
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import operator
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
-from itertools import islice
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,36 +14,8 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
 
-_S = TypeVar("_S")
-_T = TypeVar("_T")
-
 ReadGroundTruth = Callable[[], Trajectory | None]
 """Function that reads the ground truth; it returns None if the sequence has none."""
-
-_MAX_BROKEN_FRACTION, _MIN_BROKEN_LIMIT = 0.05, 10
-"""Maximum number of broken frames that are skipped on request: this fraction of the frames, or this number if it is
-larger. A sequence with more broken frames was probably copied incompletely, or opened with the wrong camera."""
-
-
-def max_broken_frames(frames: int) -> int:
-    """Return the maximum number of broken frames that can be skipped in a sequence of this length."""
-    return max(int(_MAX_BROKEN_FRACTION * frames), _MIN_BROKEN_LIMIT)
-
-
-def first_readable(read: Callable[[_S], _T], frames: Sequence[_S]) -> _T:
-    """Read the first frame that is not broken, of as many frames as can be skipped and one more.
-
-    Args:
-        read: Function that reads something of a frame, and raises InputError if the frame is broken.
-        frames: Frames, at least one, such as their indices or their files.
-
-    Raises:
-        InputError: If none of these frames can be read; the error is that of the first one.
-    """
-    for frame in frames[: max_broken_frames(len(frames)) + 1]:
-        with suppress(InputError):
-            return read(frame)
-    return read(frames[0])
 
 
 class StoredSequence(ABC):
@@ -139,47 +107,3 @@ class StoredSequence(ABC):
     @abstractmethod
     def _read(self, index: int) -> tuple[Tensor, Tensor]:
         """Read the colour and depth image of an existing frame, in the format of `RGBDFrame`."""
-
-
-class Cursor(Generic[_T]):
-    """Random access to the items of a stream that can only be read forward.
-
-    Reading forward continues the stream; reading backward restarts it, and so do reading after an error, and another
-    process, to which a cursor was copied or pickled.
-
-    Args:
-        start: Function that returns an iterator over all items.
-    """
-
-    def __init__(self, start: Callable[[], Iterator[_T]]) -> None:
-        self._start = start
-        self._process = os.getpid()
-        self._items: Iterator[_T] = iter(())
-        self._index: int | None = None
-        self._item: _T | None = None
-
-    def __getitem__(self, index: int) -> _T:
-        """Return item ``index``, counted from 0.
-
-        Raises:
-            IndexError: If the stream has no such item.
-        """
-        if self._process != os.getpid():
-            # A process that was forked shares the position in open files with its parent. The files are not closed,
-            # because a decoder would wait for its threads, which are not in this process.
-            self._of_parent = self._items
-            self._process, self._index, self._item = os.getpid(), None, None
-        if self._item is not None and index == self._index:
-            return self._item
-        if self._index is None or index < self._index:
-            self._items, self._index = self._start(), -1
-        following = islice(self._items, index - self._index - 1, None)
-        self._index = self._item = None  # a stream that raises or ends cannot be continued
-        if (item := next(following, None)) is None:
-            raise IndexError(index)
-        self._index, self._item = index, item
-        return item
-
-    def __reduce__(self) -> tuple[type[Cursor[_T]], tuple[Callable[[], Iterator[_T]]]]:
-        """Pickle the start of the stream alone."""
-        return Cursor, (self._start,)

@@ -13,7 +13,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import StrPath
-from v3d_torch.io.text import numbered_lines, replace_odd_spaces
+from v3d_torch.io.text_file import numbered_lines, replace_odd_spaces
 from v3d_torch.io.timestamps import parse_timestamp
 from v3d_torch.types import Trajectory
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, choose_camera
+from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, check_paired
-from v3d_torch.datasets.stored import Cursor
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
 from v3d_torch.io.paths import path_label

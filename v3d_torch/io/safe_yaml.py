@@ -8,7 +8,8 @@ from typing import Any
 
 import yaml
 
-from v3d_torch.io.text import first_line, replace_odd_spaces
+from v3d_torch.io.text import first_line
+from v3d_torch.io.text_file import replace_odd_spaces
 
 _MAX_LENGTH = 100_000
 """Maximum length of a YAML text, characters: longer than any valid file, and short enough for a slow parser."""

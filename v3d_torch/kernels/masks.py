@@ -1,4 +1,4 @@
-"""Kernels of masks: dilation, and growth over smooth surfaces; see `v3d_torch.objects.mask_ops` and `.mask_refiner`."""
+"""Kernels of masks: dilation, and growth over smooth surfaces; see `v3d_torch.objects.dilation` and `.mask_refiner`."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.kernels.dbscan import MAX_CELLS
 from v3d_torch.objects.dbscan import dbscan
 from v3d_torch.objects.largest_clusters import largest_clusters
-from v3d_torch.objects.mask_ops import upsample_nearest
+from v3d_torch.objects.resampling import upsample_nearest
 from v3d_torch.types import Instances
 
 

@@ -24,9 +24,11 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.objects.crops import Crop, crop_around
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.mask_ops import Crop, crop_around, dilate, ellipse, upsample_nearest
+from v3d_torch.objects.dilation import dilate, ellipse
 from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.resampling import upsample_nearest
 from v3d_torch.objects.silhouette import CELL_SIZE, silhouettes
 from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels

@@ -18,7 +18,7 @@ from torch import Tensor
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import silhouette as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.objects.mask_ops import ellipse
+from v3d_torch.objects.dilation import ellipse
 
 CELL_SIZE = 4
 """Side of the cells that collect the depths of a cloud, pixels: smaller than a cell of the network's masks, 6 pixels

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig
-from v3d_torch.objects.mask_ops import dilate
+from v3d_torch.objects.dilation import dilate
 from v3d_torch.objects.mask_refiner import RefinedMask
 
 

@@ -19,9 +19,9 @@ from v3d_torch.objects.association import (
     position_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.mask_ops import subsample
 from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
 from v3d_torch.objects.object_state import ObjectState
+from v3d_torch.objects.resampling import subsample
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
 from v3d_torch.objects.track import Detection3D, Track, predict_clouds
 from v3d_torch.types import Instances

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
-from v3d_torch.objects.mask_ops import subsample, upsample_nearest
 from v3d_torch.objects.motion_evidence import MOVED_FRACTION
 from v3d_torch.objects.newly_occupied import MIN_REGION_SIDE, NewlyOccupied
+from v3d_torch.objects.resampling import subsample, upsample_nearest
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 from v3d_torch.types import Instances
 

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from v3d_torch.config import FeaturesConfig, OdometryConfig
 from v3d_torch.features.features import Features, select_evenly
+from v3d_torch.features.fundamental_ransac import epipolar_inliers
 from v3d_torch.features.matching import match_descriptors
-from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
+from v3d_torch.features.pnp_ransac import pnp_ransac
 from v3d_torch.features.scale_pyramid import octaves_of_levels
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import se3_log

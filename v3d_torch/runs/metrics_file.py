@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from v3d_torch.config.validation import first_error
 from v3d_torch.errors import InputError
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text_file import read_text
 from v3d_torch.types import TrackingStatus
 
 _MAX_DEPTH = 3

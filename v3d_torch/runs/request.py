@@ -21,7 +21,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text_file import read_text
 from v3d_torch.runs.file_names import RunFile
 
 CHANGEABLE = ("seq", "data_root", "skip_broken")

@@ -14,7 +14,8 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import Evaluation, evaluate
-from v3d_torch.io.text import first_line, read_text
+from v3d_torch.io.text import first_line
+from v3d_torch.io.text_file import read_text
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import Metrics, read_metrics, suggest_folder
 from v3d_torch.types import Trajectory

@@ -16,7 +16,7 @@ from v3d_torch.datasets.image_files import list_images, stamp_in_name
 from v3d_torch.errors import InputError
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.safe_yaml import parse_yaml
-from v3d_torch.io.text import read_text
+from v3d_torch.io.text_file import read_text
 from v3d_torch.segmentation.coco import COCO_NAMES, PERSON
 from v3d_torch.types import Instances, RGBDFrame
 

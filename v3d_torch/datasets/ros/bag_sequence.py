@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.datasets.broken_frames import first_readable
 from v3d_torch.datasets.camera_fields import camera_from_fields
 from v3d_torch.datasets.cameras import CameraChoice, camera_file, choose_camera
+from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, note_unpaired
 from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
-from v3d_torch.datasets.stored import Cursor, first_readable
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_scale import MILLIMETRES

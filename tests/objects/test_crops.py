@@ -1,20 +1,12 @@
-"""Operations on masks: cropping, subsampling."""
+"""Parts of an image that contain a mask."""
 
 from __future__ import annotations
 
 import numpy as np
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3d_torch.objects.mask_ops import crop_around, subsample
-
-
-@given(step=st.integers(1, 5), height=st.integers(1, 12), width=st.integers(1, 12))
-def test_subsample_equals_slicing(step: int, height: int, width: int) -> None:
-    for images in (torch.rand(2, height, width), torch.rand(height, width) < 0.5):
-        found = subsample(images, step)
-        assert torch.equal(found, images[..., ::step, ::step]) and found.is_contiguous()
+from v3d_torch.objects.crops import crop_around
 
 
 @given(seed=st.integers(0, 2**16), margin=st.integers(0, 6), step=st.integers(1, 5))

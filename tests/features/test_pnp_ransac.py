@@ -1,4 +1,4 @@
-"""Epipolar RANSAC and PnP-RANSAC on two views whose motion is known, and against OpenCV; padding, P3P, gradients."""
+"""PnP-RANSAC on two views whose motion is known, and against OpenCV; padding, P3P, gradients."""
 
 from __future__ import annotations
 
@@ -8,21 +8,13 @@ import torch
 from helpers import camera_inputs
 from helpers.two_views import CAMERA, two_views
 
-from v3d_torch.features.ransac import epipolar_inliers, pnp_ransac
+from v3d_torch.features.pnp_ransac import pnp_ransac
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.optim.pose_refinement import refine_pose
 
 
-def test_epipolar_inliers_are_those_of_one_motion() -> None:
-    a, b, _ = two_views(outliers=100)
-    inliers = epipolar_inliers(a.uv, b.uv, threshold=1.0, iterations=500, seed=0)
-    assert inliers[:300].all()
-    assert inliers[300:].sum() < 15  # some outliers lie on their epipolar line by chance
-
-
-def test_ransac_of_too_few_points_has_no_result() -> None:
+def test_too_few_points_give_no_pose() -> None:
     a, b, _ = two_views()
-    assert not epipolar_inliers(a.uv[:7], b.uv[:7], threshold=1.0, iterations=10, seed=0).any()
     points = CAMERA.back_project(a.uv[:5], a.depth[:5])
     pose = pnp_ransac(points, b.uv[:5], CAMERA.K, threshold=2.0, iterations=10, seed=0)
     assert not pose.found and not pose.inliers.any()
@@ -40,7 +32,7 @@ def test_initial_guess_that_explains_half_of_the_points_skips_sampling(monkeypat
     def fail(*_: object, **__: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("v3d_torch.features.ransac._sample_opencv", fail)
+    monkeypatch.setattr("v3d_torch.features.pnp_ransac._sample_opencv", fail)
     guess = _perturb(T_ba, 0.02, 0.02)
     guessed = pnp_ransac(points, b.uv, CAMERA.K, guess, threshold=2.0, iterations=100, seed=0)
     assert sampled.found and guessed.found

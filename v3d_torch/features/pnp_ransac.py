@@ -1,4 +1,4 @@
-"""RANSAC for the epipolar constraint between two images and for the pose from 3D points (paper, Sec. III-E)."""
+"""RANSAC for the pose of a camera from 3D points and their pixels (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import cv2
-import kornia_rs
 import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
@@ -24,35 +23,8 @@ from v3d_torch.optim.pose_refinement import refine_pose
 from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
 from v3d_torch.runtime.batches import common_batch, mask_or_all
 
-_MIN_EPIPOLAR_PAIRS = 8
-"""Minimum number of pairs for a fundamental matrix (eight-point algorithm)."""
-
 _MIN_PNP_POINTS = 6
 """Minimum number of points: a sample of 3, a point that selects one of its four poses, and points that confirm it."""
-
-
-def epipolar_inliers(uv_a: Tensor, uv_b: Tensor, *, threshold: float, iterations: int, seed: int) -> Tensor:
-    """Inliers of the fundamental matrix F, which satisfy the epipolar constraint x_b^T F x_a = 0.
-
-    Args:
-        uv_a: Undistorted pixels in image a, float64, shape :math:`(N, 2)`.
-        uv_b: Undistorted pixels of the same points in image b, float64, shape :math:`(N, 2)`.
-        threshold: Maximum Sampson distance of an inlier, pixels.
-        iterations: Maximum number of hypotheses.
-        seed: Seed of the sampling.
-
-    Returns:
-        Inlier mask, bool, shape :math:`(N,)`; all false for fewer than 8 pairs or if no matrix is found.
-    """
-    no_inliers = torch.zeros(uv_a.shape[0], dtype=torch.bool)
-    if uv_a.shape[0] < _MIN_EPIPOLAR_PAIRS:
-        return no_inliers
-    pairs = torch.cat([uv_a, uv_b], dim=1).contiguous().numpy()
-    try:
-        result = kornia_rs.ransac.fundamental(pairs, threshold=threshold, max_iters=iterations, seed=seed)
-    except ValueError:  # raised by kornia-rs if no sample gives a model
-        return no_inliers
-    return torch.tensor(result.inliers, dtype=torch.bool)
 
 
 class PnP(NamedTuple):
