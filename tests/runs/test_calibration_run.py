@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from io import StringIO
+from pathlib import Path
 from unittest.mock import MagicMock, Mock
 
 import pytest
@@ -13,6 +14,8 @@ from rich.console import Console
 from v3d_torch.calibration.camera_calibration import Calibration
 from v3d_torch.calibration.selection import Estimate
 from v3d_torch.config import Config
+from v3d_torch.datasets.cameras import load_camera
+from v3d_torch.io.files import write_text
 from v3d_torch.runs import calibration_run
 from v3d_torch.runs.calibration_run import (
     UNITS,
@@ -46,6 +49,12 @@ def test_value_is_rounded_to_the_second_digit_of_its_deviation(value: float, sig
     console.print(calibration_table(calibration))
     row = next(line for line in console.export_text().splitlines() if "fx, pixels" in line)
     assert [cell.strip() for cell in row.split("│")[3:5]] == expected.split(" +- ")
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "not UTF-8 \udcff"])
+def test_file_of_a_sequence_with_any_name_can_be_read(tmp_path: Path, name: str) -> None:
+    write_text(tmp_path / "camera.yaml", calibration_text(calibrated(), name))
+    assert load_camera(tmp_path / "camera.yaml") == CAMERA
 
 
 def test_names_of_parameters_are_not_broken_at_80_columns() -> None:

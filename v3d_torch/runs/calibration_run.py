@@ -16,6 +16,7 @@ from v3d_torch.datasets.base import RGBDSequence
 from v3d_torch.datasets.camera_text import camera_text
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.text import printable
 from v3d_torch.pipeline import FrameCallback, Pipeline
 from v3d_torch.runs.system import check_map_is_given, make_system
 from v3d_torch.runtime.process import set_num_threads
@@ -128,8 +129,8 @@ def calibration_text(calibration: Calibration, name: str) -> str:
             f"{each.name} {_describe(each)}" if field != each.name else _describe(each)
         )
     heading = (
-        f"# Calibrated by v3d-torch calibrate from {name}. A value is replaced only if the recording determines it; the"
-        " comment states why the others were kept.\n"
+        f"# Calibrated by v3d-torch calibrate from {printable(name)}. A value is replaced only if the recording"
+        " determines it; the comment states why the others were kept.\n"
     )
     return heading + camera_text(calibration.camera, {field: "; ".join(texts) for field, texts in comments.items()})
 
