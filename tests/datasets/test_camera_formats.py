@@ -163,3 +163,10 @@ def test_odd_spaces_in_camera_files_are_spaces(tmp_path: Path) -> None:
 def test_matrix_of_numpy_equals_the_numbers(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "K.txt", np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]]))
     assert load_camera(tmp_path / "K.txt") == PinholeCamera(500, 510, 320, 240)
+
+
+@pytest.mark.parametrize(
+    "start", ["# My camera\n---\n", "%YAML 1.2\n---\n", "# My camera\n\n--- # of the robot\n", "---\n---\n"]
+)
+def test_document_can_start_after_comments_and_directives(tmp_path: Path, start: str) -> None:
+    assert load(tmp_path, start + CAMERA_YAML + "---\nfx: 1\n") == load(tmp_path, CAMERA_YAML, "plain.yaml")

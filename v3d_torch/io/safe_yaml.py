@@ -18,6 +18,12 @@ _MAX_LENGTH = 100_000
 _OPENCV_HEADER, _OPENCV_MATRIX = "%YAML:1.0", "!!opencv-matrix"
 """First line and matrix tag of OpenCV's files. Neither is valid YAML."""
 
+_DOCUMENT_START = re.compile(r"^---\s*$", re.MULTILINE)
+"""Line before a document. Before the first one, there can be comments and directives such as ``%YAML 1.2``."""
+
+_CONTENT = re.compile(r"^\s*[^\s#%]", re.MULTILINE)
+"""Line of a document that is neither empty, nor a comment or a directive."""
+
 
 def to_valid_yaml(text: str) -> str:
     """Convert a file of OpenCV or ROS to a single valid YAML document, and replace odd spaces.
@@ -30,8 +36,9 @@ def to_valid_yaml(text: str) -> str:
     Returns:
         The first document, without OpenCV's header and its matrix tags: a matrix is a mapping with the key ``data``.
     """
-    text = replace_odd_spaces(text).strip().removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, "").strip()
-    return re.split(r"^---\s*$", text.removeprefix("---"), maxsplit=1, flags=re.MULTILINE)[0]
+    text = replace_odd_spaces(text).strip().removeprefix(_OPENCV_HEADER).replace(_OPENCV_MATRIX, "")
+    documents = _DOCUMENT_START.split(text)
+    return next((document for document in documents if _CONTENT.search(document) is not None), "")
 
 
 def parse_yaml(text: str) -> Any:
