@@ -215,6 +215,12 @@ def test_images_are_listed_in_numerical_order(tmp_path: Path) -> None:
         ),
         (["rgb/10.5.png"], ["depth/11.5.png"], FPS, "no colour image is within 0.02 s"),
         (
+            ["rgb/2.9.png", "rgb/2.1.png", "rgb/2.10.png"],
+            ["depth/2.9.png", "depth/2.1.png", "depth/2.10.png"],
+            SourceOptions(),
+            "2.1.png and 2.10.png have the same timestamp; pass the frame rate with --fps",
+        ),
+        (
             ["rgb/1.png", "color/1.png"],
             ["depth/1.png"],
             FPS,

@@ -65,6 +65,16 @@ def test_scannet_frames_match_files(folder: Path, nested: bool) -> None:
     assert sequence.groundtruth.T_wc[1, :3, 3].tolist() == [2, 0, 0]
 
 
+def test_colour_images_without_depth_are_left_out_with_a_note(folder: Path) -> None:
+    (folder / "depth" / "100.png").unlink()
+    save(folder / "color" / "thumbnail.png", colour_of(1))  # has no number, so that it is no frame
+    sequence = load_sequence(folder)
+    assert isinstance(sequence, ScanNetSequence) and len(sequence) == 2
+    assert sequence.notes == [
+        "1 of 3 colour images have no depth image of the same frame number and are left out (the last is 100.png)"
+    ]
+
+
 def test_warped_colour_has_the_rays_of_the_depth_camera(folder: Path) -> None:
     """The tolerance is a fraction of a grey level; on the ramps, 0.1 pixels are 0.2 grey levels."""
     image = load_sequence(str(folder))[0].image

@@ -37,6 +37,17 @@ def test_seven_scenes_frames_match_files(folder: Path) -> None:
     assert sequence.groundtruth.T_wc[:, :3, 3].tolist() == [[0, 2, 3], [1, 2, 3]]
 
 
+def test_colour_images_without_depth_are_left_out_with_a_note(folder: Path) -> None:
+    sequence = load_sequence(folder)
+    assert isinstance(sequence, SevenScenesSequence) and sequence.notes == []
+    (folder / "frame-000001.depth.png").unlink()
+    sequence = load_sequence(folder)
+    assert isinstance(sequence, SevenScenesSequence) and sequence.notes == [
+        "1 of 2 colour images have no depth image of the same frame number and are left out (the last is"
+        " frame-000001.color.png)"
+    ]
+
+
 def test_missing_and_damaged_poses_give_no_ground_truth(folder: Path) -> None:
     file = folder / "frame-000000.pose.txt"
     file.write_text("no pose")

@@ -51,12 +51,14 @@ class ICLNUIMSequence(PairedImages):
                 f"{folder}: has several ground-truth files ({', '.join(path.name for path in groundtruth_files)});"
                 " keep only the file of this sequence"
             )
+        pairs, note = _original_pairs(folder) if self._is_original else (_listed_pairs(folder), None)
         super().__init__(
             folder,
-            _original_pairs(folder) if self._is_original else _listed_pairs(folder),
+            pairs,
             camera,
             lambda: camera_poses(read_trajectory(groundtruth_files[0])) if groundtruth_files else None,
             published=lambda: CAMERA,
+            pairing_note=note,
         )
 
     def _read_depth(self, index: int) -> NDArray[np.generic]:
@@ -90,8 +92,8 @@ def _is_original(folder: Path) -> bool:
     return any(folder.glob("scene_*.depth"))
 
 
-def _original_pairs(folder: Path) -> list[ImagePair]:
-    """Pairs of the original files; frame n has the number n in its file names and in the ground truth."""
+def _original_pairs(folder: Path) -> tuple[list[ImagePair], str | None]:
+    """Pairs of the original files, see `pair_by_number`; frame n has the number n in its file names and the truth."""
     return pair_by_number(folder, folder.glob("scene_*.png"), folder.glob("scene_*.depth"), _RATE)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -53,7 +53,9 @@ def stamp_in_name(path: Path) -> float | None:
     return parse_timestamp(match[1]) if match else None
 
 
-def pair_by_number(folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float) -> list[ImagePair]:
+def pair_by_number(
+    folder: Path, colour: Iterable[Path], depth: Iterable[Path], rate: float
+) -> tuple[list[ImagePair], str | None]:
     """Pair colour and depth images with equal frame numbers.
 
     Args:
@@ -63,21 +65,42 @@ def pair_by_number(folder: Path, colour: Iterable[Path], depth: Iterable[Path], 
         rate: Frame rate, Hz: converts frame numbers to timestamps.
 
     Returns:
-        Pairs in the order of their frame numbers.
+        Pairs in the order of their frame numbers; and a sentence on colour images without depth, None if all have one.
 
     Raises:
         InputError: If no frame number has both images.
     """
-    by_number = [{frame_number(path): path for path in files} for files in (colour, depth)]
-    numbers = sorted(number for number in by_number[0].keys() & by_number[1].keys() if number is not None)
+    by_number = [
+        {number: path for path in files if (number := frame_number(path)) is not None} for files in (colour, depth)
+    ]
+    numbers = sorted(by_number[0].keys() & by_number[1].keys())
     if not numbers:
         raise InputError(
             f"{folder}: no colour image has the same frame number as a depth image; check that both belong to the same"
             " recording"
         )
-    return [
+    pairs = [
         ImagePair(number / rate, *(str(files[number].relative_to(folder)) for files in by_number)) for number in numbers
     ]
+    in_order = [by_number[0][number] for number in sorted(by_number[0])]
+    return pairs, note_unpaired_files(in_order, {by_number[0][number] for number in numbers}, "frame number")
+
+
+def note_unpaired_files(colour: Sequence[Path], paired: Container[Path], key: str) -> str | None:
+    """Return a sentence on the colour images that have no depth image; None if all have one.
+
+    Args:
+        colour: Colour images in their order.
+        paired: Those that have a depth image.
+        key: What the two images of a frame have in common, such as their name.
+    """
+    unpaired = [path for path in colour if path not in paired]
+    if not unpaired:
+        return None
+    return (
+        f"{len(unpaired)} of {len(colour)} colour images have no depth image of the same {key} and are left out (the"
+        f" last is {unpaired[-1].name})"
+    )
 
 
 def _since_1970(match: re.Match[str]) -> float | None:

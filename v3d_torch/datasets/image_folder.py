@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 from v3d_torch.datasets.cameras import CameraChoice
-from v3d_torch.datasets.image_files import list_images, stamp_in_name
+from v3d_torch.datasets.image_files import list_images, note_unpaired_files, stamp_in_name
 from v3d_torch.datasets.lists import (
     MAX_STAMP_DIFFERENCE,
     MIN_PAIRED,
@@ -44,7 +45,7 @@ class ImageFolder(PairedImages):
 
     Raises:
         InputError: If there are no pairs, too few of the images have equal names, there are no timestamps or no camera,
-            or the timestamps are not in a known unit.
+            two images have the same timestamp, or the timestamps are not in a known unit.
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None, *, fps: float | None = None) -> None:
@@ -57,7 +58,7 @@ class ImageFolder(PairedImages):
                 *(str(path.relative_to(folder)) for path in pair),
                 depth_delay=_delay(stamp, pair[1]) if fps is None else 0.0,
             )
-            for stamp, pair in sorted(dict(zip(stamps, files, strict=True)).items())
+            for stamp, pair in sorted(zip(stamps, files, strict=True))
         ]
         if fps is None:
             check_stamp_unit(pairs, folder)
@@ -113,25 +114,13 @@ def _pair(folder: Path, colour: list[Path], depth: list[Path]) -> tuple[list[tup
         return [(in_order[i], depth_in_order[j]) for i, j in indices], note
     pairs = max((_pair_by_name(colour, depth, name) for name in (_without_kind, _without_zeros)), key=len)
     if len(pairs) >= MIN_PAIRED * min(len(colour), len(depth)):
-        return pairs, _note_unpaired_names(colour, pairs)
+        return pairs, note_unpaired_files(colour, {path for path, _ in pairs}, "name")
     if pairs or len(colour) != len(depth):
         raise InputError(
             f"{folder}: has {len(colour)} colour and {len(depth)} depth images, of which {len(pairs)} can be paired by"
             " name; give the two images of a frame the same name"
         )
     return list(zip(colour, depth, strict=True)), None
-
-
-def _note_unpaired_names(colour: list[Path], pairs: list[tuple[Path, Path]]) -> str | None:
-    """Return a sentence on the colour images without a depth image of the same name; None if all have one."""
-    paired = {path for path, _ in pairs}
-    unpaired = [path for path in colour if path not in paired]
-    if not unpaired:
-        return None
-    return (
-        f"{len(unpaired)} of {len(colour)} colour images have no depth image of the same name and are left out (the"
-        f" last is {unpaired[-1].name})"
-    )
 
 
 def _pair_by_name(colour: list[Path], depth: list[Path], name: Callable[[Path], str]) -> list[tuple[Path, Path]]:
@@ -167,6 +156,12 @@ def _stamps(folder: Path, colour: list[Path], paired: list[Path], fps: float | N
         raise InputError(
             f"{folder}: file names such as {paired[0].name} are not timestamps; pass the frame rate with --fps"
         )
+    for (earlier, path), (later, following) in pairwise(sorted(zip(stamps, paired, strict=True))):
+        if earlier == later:
+            raise InputError(
+                f"{folder}: {path.name} and {following.name} have the same timestamp; pass the frame rate with --fps if"
+                " file names only look like timestamps, or keep the images of one camera"
+            )
     return stamps
 
 

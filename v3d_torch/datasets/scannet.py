@@ -47,7 +47,7 @@ class ScanNetSequence(PairedImages):
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
         frames = _frames_folder(folder)
-        pairs = pair_by_number(frames, list_images(frames / "color"), list_images(frames / "depth"), _RATE)
+        pairs, note = pair_by_number(frames, list_images(frames / "color"), list_images(frames / "depth"), _RATE)
         stamps = {round(pair.stamp * _RATE): pair.stamp for pair in pairs}
         pose_files = {frame_number(path): path for path in frames.glob("pose/*.txt")}
         super().__init__(
@@ -58,6 +58,7 @@ class ScanNetSequence(PairedImages):
             published=lambda: first_readable(partial(_depth_camera, frames), pairs),
             depth_scale=_DEPTH_SCALE,
             name=folder.resolve().name,
+            pairing_note=note,
         )
         self._colour_camera = colour = _intrinsics_file(frames, "color")
         self._K_colour = _read_camera_matrix(colour)[:3, :3] if colour is not None else None

@@ -30,7 +30,7 @@ class SevenScenesSequence(PairedImages):
     """
 
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
-        pairs = pair_by_number(folder, folder.glob("frame-*.color.*"), folder.glob("frame-*.depth.*"), _RATE)
+        pairs, note = pair_by_number(folder, folder.glob("frame-*.color.*"), folder.glob("frame-*.depth.*"), _RATE)
         pose_files = {pair.stamp: folder / f"{pair.colour.split('.')[0]}.pose.txt" for pair in pairs}
         super().__init__(
             folder,
@@ -39,6 +39,7 @@ class SevenScenesSequence(PairedImages):
             lambda: read_poses({stamp: path for stamp, path in pose_files.items() if path.is_file()}),
             published=lambda: CAMERA,
             name="/".join(folder.resolve().parts[-2:]),
+            pairing_note=note,
         )
 
 
