@@ -184,7 +184,17 @@ def test_change_of_a_sample_in_place_does_not_reach_the_next(sequence: RGBDSeque
             lambda s: v3d.PairDataset(s, interval=6),
             "has no frames for a sample among its 6 frames, of which 6 have a true",
         ),
+        (
+            lambda s: v3d.PairDataset(s, interval=2.0),
+            "interval is 2.0; give a positive number of frames, as an integer",
+        ),
+        (
+            lambda s: v3d.PairDataset(s, interval="2"),
+            "interval is '2'; give a positive number of frames, as an integer",
+        ),
         (lambda s: v3d.ClipDataset(s, 0), "frames_per_clip is 0; give"),
+        (lambda s: v3d.ClipDataset(s, 2.5), "frames_per_clip is 2.5; give"),
+        (lambda s: v3d.ClipDataset(s, 2, None), "step_between_clips is None; give"),
         (lambda s: v3d.ClipDataset(s, 900), "use fewer frames, or a smaller interval"),
         (lambda s: v3d.ClipDataset(s, 2, -1), "step_between_clips is -1; give"),
         (

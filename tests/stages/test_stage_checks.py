@@ -239,8 +239,11 @@ def test_stage_that_cannot_be_called_is_rejected_at_once(name: str, stage: Any) 
         ("back_end", "^back_end was replaced by a stage without result; derive it from BackEnd$"),
     ],
 )
-def test_function_in_place_of_a_stage_with_methods_is_named(stage: str, message: str) -> None:
+@pytest.mark.parametrize("hook", [False, True])
+def test_function_in_place_of_a_stage_with_methods_is_named(stage: str, message: str, hook: bool) -> None:
     slam = make_slam()
+    if hook:
+        slam.register_stage_hook(None, lambda *call: None)
     setattr(slam, stage, getattr(slam, stage).__call__ if stage != "back_end" else lambda: None)
     with pytest.raises(ConfigError, match=message):
         for frame in FRAMES:

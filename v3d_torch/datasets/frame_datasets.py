@@ -7,8 +7,10 @@ your own. All samples of a data set have the same keys. Names follow torchvision
 
 from __future__ import annotations
 
+import operator
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import torch
 from torch import Tensor
@@ -168,8 +170,8 @@ class PairDataset(SequenceDataset):
         transform: Function that is applied to each sample; None for none.
 
     Raises:
-        InputError: If the interval is not positive, the sequence has no stored frames, or no pair with true poses
-            although it has ground truth.
+        InputError: If the interval is not a positive integer, the sequence has no stored frames, or no pair with true
+            poses although it has ground truth.
     """
 
     def __init__(self, sequence: RGBDSequence, interval: int = 1, transform: Transform | None = None) -> None:
@@ -200,8 +202,8 @@ class ClipDataset(SequenceDataset):
         transform: Function that is applied to each sample; None for none.
 
     Raises:
-        InputError: If a number is not positive, the sequence has no stored frames, or no clip with true poses although
-            it has ground truth.
+        InputError: If a number is not a positive integer, the sequence has no stored frames, or no clip with true poses
+            although it has ground truth.
     """
 
     def __init__(
@@ -221,8 +223,11 @@ class ClipDataset(SequenceDataset):
 
 
 def _check_positive(name: str, value: int) -> None:
-    if value < 1:
-        raise InputError(f"{name} is {value}; give a positive number of frames")
+    """Raise an error unless a value is a positive integer, of Python, NumPy or torch."""
+    with suppress(TypeError):
+        if operator.index(value) >= 1:
+            return
+    raise InputError(f"{name} is {value!r}; give a positive number of frames, as an integer")
 
 
 def _is_known(truth: Trajectory, stamps: Tensor) -> Tensor:

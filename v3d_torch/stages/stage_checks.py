@@ -213,7 +213,8 @@ class ReplacedStage(CheckingProxy):
             if name.startswith("_") or name in STATE_METHODS or not hasattr(self._replaced, name):
                 raise
             raise ConfigError(
-                f"{self._name} was replaced by a stage without {name}; derive it from {type(self._replaced).__name__}"
+                f"{self._name} was replaced by a stage without {name}; derive it from"
+                f" {self._replaced.__class__.__name__}"  # which is that of the stage if it is a proxy
             ) from None
 
     def _check(self, result: Any, *args: Any) -> None:
