@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 
+from v3d_torch.errors import InputError
 from v3d_torch.features.matching import hamming_distance, match_descriptors
 from v3d_torch.kernels.compiler import ENABLED, TWINS
 
@@ -55,6 +56,16 @@ def test_matches_with_ratio_test_equal_kornia_rs(max_ratio: float) -> None:
 def test_wrong_shapes_are_rejected(a: tuple[int, ...], b: tuple[int, ...]) -> None:
     with pytest.raises(ShapeError):
         match_descriptors(*(torch.zeros(shape, dtype=torch.uint8) for shape in (a, b)))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.int64])
+@pytest.mark.parametrize("name", ["a", "b"])
+def test_descriptors_that_are_not_bytes_are_rejected(name: str, dtype: torch.dtype) -> None:
+    inputs = {"a": random_descriptors(5, 0), "b": random_descriptors(5, 0)}
+    with pytest.raises(
+        InputError, match=rf"^{name} has the type {dtype}; give binary descriptors of type torch\.uint8$"
+    ):
+        match_descriptors(**inputs | {name: 1000 * inputs[name].to(dtype)})
 
 
 def test_too_few_descriptors_have_no_matches() -> None:

@@ -7,6 +7,7 @@ import pytest
 import torch
 from helpers import camera_inputs
 from helpers.two_views import CAMERA, two_views
+from kornia.core.exceptions import ShapeError
 
 from v3d_torch.features.pnp_ransac import pnp_ransac
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
@@ -18,6 +19,12 @@ def test_too_few_points_give_no_pose() -> None:
     points = CAMERA.back_project(a.uv[:5], a.depth[:5])
     pose = pnp_ransac(points, b.uv[:5], CAMERA.K, threshold=2.0, iterations=10, seed=0)
     assert not pose.found and not pose.inliers.any()
+
+
+def test_initial_guess_of_another_shape_is_rejected() -> None:
+    a, b, T_ba = two_views()
+    with pytest.raises(ShapeError):
+        pnp_ransac(CAMERA.back_project(a.uv, a.depth), b.uv, CAMERA.K, initial_guess=T_ba[:3])
 
 
 def _perturb(T: torch.Tensor, metres: float, radians: float) -> torch.Tensor:

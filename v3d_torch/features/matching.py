@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import OdometryConfig
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.kernels import descriptors as descriptor_kernels
@@ -107,9 +108,12 @@ def match_descriptors(
         ``a`` or ``b`` has fewer than two descriptors.
 
     Raises:
-        InputError: If a mask is not bool.
+        InputError: If a mask is not bool, or descriptors are not uint8.
     """
     check_masks(a_valid=a_valid, b_valid=b_valid)
+    for name, descriptors in (("a", a), ("b", b)):
+        if descriptors.dtype != torch.uint8:
+            raise InputError(f"{name} has the type {descriptors.dtype}; give binary descriptors of type torch.uint8")
     KORNIA_CHECK_SHAPE(a, ["*", "N", "D"])
     KORNIA_CHECK_SHAPE(b, ["*", "M", str(a.shape[-1])])
     distance = _pairwise_hamming_distances(a, b)

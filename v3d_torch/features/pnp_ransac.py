@@ -87,6 +87,8 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     present = mask_or_all(valid, uv[..., 0]) & points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)
+    if initial_guess is not None:
+        KORNIA_CHECK_SHAPE(initial_guess, ["*", "4", "4"])
     guess = torch.Size() if initial_guess is None else initial_guess.shape[:-2]
     batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2], present.shape[:-1], guess)
     mask = present.expand(*batch, -1)
