@@ -170,3 +170,13 @@ def test_matrix_of_numpy_equals_the_numbers(tmp_path: Path) -> None:
 )
 def test_document_can_start_after_comments_and_directives(tmp_path: Path, start: str) -> None:
     assert load(tmp_path, start + CAMERA_YAML + "---\nfx: 1\n") == load(tmp_path, CAMERA_YAML, "plain.yaml")
+
+
+@pytest.mark.parametrize(
+    "matrix", ["[500, 0, 0, 0, 500, 0, 320, 240, 1]", "[500, 0, 320, 0, 0, 500, 240, 0, 0, 0, 1, 0]"]
+)
+def test_camera_matrix_in_another_order_is_rejected(tmp_path: Path, matrix: str) -> None:
+    """Transposed, as MATLAB has it, its principal point would be (0, 0)."""
+    text = f"width: 640\nheight: 480\nK: {matrix}\nD: [0, 0, 0, 0, 0]\n"
+    with pytest.raises(InputError, match="the camera matrix is not 3x3 with the last row 0 0 1"):
+        load(tmp_path, text)

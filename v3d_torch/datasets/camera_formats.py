@@ -124,6 +124,8 @@ def _kalibr(camera: Mapping[str, Any], source: str) -> Fields:
 def _ros(keys: Mapping[str, Any]) -> Fields:
     """Fields of a ``CameraInfo`` of ROS or a calibration of OpenCV; keys in lower case without underscores."""
     K = _numbers(keys.get("cameramatrix", keys.get("k")))
+    if len(K) != 9 or (any(K) and K[6:] != [0.0, 0.0, 1.0]):  # ROS writes zeros for a camera that is not calibrated
+        raise ValueError("the camera matrix is not 3x3 with the last row 0 0 1")
     D = _numbers(next((keys[name] for name in _LENS_KEYS if name in keys), []))
     fields: Fields = {"fx": K[0], "fy": K[4], "cx": K[2], "cy": K[5]}
     for name in ("width", "height"):
