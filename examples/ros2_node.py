@@ -41,8 +41,8 @@ class SlamNode(Node):
         config = self.declare_parameter("config", "realtime").value
         overrides = self.declare_parameter("set", ["occupancy.enabled=true"]).value
         _, info = wait_for_message(CameraInfo, self, INFO)
-        pinhole = *info.k[[0, 4, 2, 5]], info.width, info.height, tuple(info.d)
-        self.camera = v3d.PinholeCamera(*pinhole, depth_scale=1000, distortion_model=info.distortion_model)  # REP 118
+        pinhole = *info.k[[0, 4, 2, 5]], info.width, info.height, tuple(info.d), 1000  # depth in millimetres: REP 118
+        self.camera = v3d.PinholeCamera(*pinhole, distortion_model=info.distortion_model or "plumb_bob")
         self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
         self._messages, self._store = RunMessages(self.camera), get_typestore(Stores.ROS2_HUMBLE)

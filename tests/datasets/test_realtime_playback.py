@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 
 import pytest
@@ -74,6 +75,25 @@ def test_stop_ends_the_iteration_and_the_next_one_starts_again() -> None:
     playback.stop()
     assert list(frames) == []
     assert len(list(playback)) == FRAMES
+
+
+def test_stop_ends_the_wait_in_a_gap_of_the_recording() -> None:
+    class StoppingClock(SimulatedClock):
+        def sleep(self, seconds: float) -> None:
+            super().sleep(seconds)
+            playback.stop()
+
+    class Stream:
+        name, camera, groundtruth = "stream", CAMERA, None
+
+        def __iter__(self) -> Iterator[RGBDFrame]:
+            yield StoredWall()[0]
+            yield replace(StoredWall()[1], stamp=1000.0)
+
+    clock = StoppingClock()
+    playback = RealtimePlayback(Stream(), clock)
+    assert [frame.index for frame in playback] == [0]
+    assert clock.time < 51
 
 
 def test_playback_has_name_camera_and_ground_truth_of_its_source_and_is_live() -> None:

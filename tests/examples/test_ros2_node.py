@@ -44,10 +44,12 @@ def images(node: Any) -> Iterator[Pair]:
         wait_until(lambda: len(node.slam.poses) > index, 60, f"image {index} was tracked")  # noqa: B023 - called here
 
 
-def make_ros(images: Callable[[Any], Iterator[Pair]]) -> FakeROS:
+def make_ros(
+    images: Callable[[Any], Iterator[Pair]], *, d: list[float] = 5 * [0.0], model: str = "plumb_bob"
+) -> FakeROS:
     """ROS with the camera of the wall and some images."""
     k = [CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1]
-    info = MessageFactory("mcap").info(CAMERA.width, CAMERA.height, k, [0.0] * 5, [0.0] * 12)
+    info = MessageFactory("mcap").info(CAMERA.width, CAMERA.height, k, d, [0.0] * 12, model)
     settings = ["segmentation.source=none", "mapping.max_keyframe_interval=5", "occupancy.enabled=true"]
     return FakeROS(info, images, {"set": settings})
 
@@ -129,6 +131,12 @@ def test_node_skips_unreadable_images_and_ends_when_spinning_fails() -> None:
     assert not thread.is_alive()
     assert len(ros.published["/odom"]) == 2
     assert len(ros.warnings) == 2 and "a frame is skipped: camera/color/image_raw: " in ros.warnings[0]
+
+
+def test_camera_without_distortion_can_leave_its_model_empty() -> None:
+    ros = make_ros(lambda node: islice(images(node), 2), d=[], model="")
+    run_node(ros)
+    assert len(ros.published["/odom"]) == 2
 
 
 def test_node_is_shorter_than_a_hundred_lines() -> None:

@@ -142,12 +142,13 @@ def test_grid_needs_no_points_of_the_whole_map(monkeypatch: pytest.MonkeyPatch) 
     assert len(occupancy.blocks) > 4 and max(sizes) == 2 * VOLUME
 
 
-@pytest.mark.parametrize("heights", [(0.5, 0.5), (1.0, 0.2), (0.1, math.nan)])
-def test_heights_in_the_wrong_order_are_rejected(heights: tuple[float, float]) -> None:
+@pytest.mark.parametrize("heights", [(0.5, 0.5), (1.0, 0.2), (0.1, math.nan), (0.1, math.inf)])
+def test_heights_in_the_wrong_order_or_without_a_bound_are_rejected(heights: tuple[float, float]) -> None:
     with pytest.raises(ConfigError, match="give the lowest obstacle first"):
         occupancy_grid(OccupancyMap(CONFIG), FLOOR, heights)
+    values = str(list(heights)).replace("nan", ".nan").replace("inf", ".inf")
     with pytest.raises(ConfigError, match=r"occupancy\.obstacle_heights: .*lowest height should be below"):
-        load_config(overrides=[f"occupancy.obstacle_heights={list(heights)}".replace("nan", ".nan")])
+        load_config(overrides=[f"occupancy.obstacle_heights={values}"])
 
 
 def test_heights_closer_than_a_voxel_use_the_space_between_them() -> None:

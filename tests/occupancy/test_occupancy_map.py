@@ -11,6 +11,7 @@ from helpers.box_room import CAMERA, CRATE, distance_to, looking_around, render
 from helpers.occupancy_scenes import ALL, CONFIG, add_view, box_of_voxels, map_of, map_of_room
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -149,6 +150,14 @@ def test_point_that_all_views_see_through_is_never_occupied(
 
 
 # --- free balls
+
+
+@pytest.mark.parametrize("query", ["states", "probability", "is_free", "distance", "gradient"])
+@pytest.mark.parametrize("shape", [(2, 4), (3, 4), (5, 2), (4,)])
+def test_points_of_another_shape_are_rejected(query: str, shape: tuple[int, ...], room: OccupancyMap) -> None:
+    """Such as homogeneous points, before they are cut to three coordinates."""
+    with pytest.raises(ShapeError, match="expected 3, got"):
+        getattr(room, query)(torch.ones(shape))
 
 
 def is_free_by_brute_force(occupancy: OccupancyMap, point: Tensor, radius: float) -> bool:

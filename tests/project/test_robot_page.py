@@ -9,6 +9,7 @@ import signal
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 import v3d_torch as v3d
 from v3d_torch.cli.commands import app
 from v3d_torch.config.loading import load_config
+from v3d_torch.objects.frame_objects import MotionState
 
 PAGE = (Path(__file__).parents[2] / "docs" / "robot.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^v3d-torch ([^#\n]*)", PAGE, re.MULTILINE)
@@ -103,6 +105,16 @@ def test_example_runs(folder: Path, source: str, monkeypatch: pytest.MonkeyPatch
     names: dict[str, object] = {}
     exec(code, names)  # noqa: S102
     assert names["free"].shape == names["clearance"].shape == (3,)  # type: ignore[attr-defined]
+
+
+def test_objects_of_the_example_are_all_that_the_map_leaves_out_and_whose_place_is_known() -> None:
+    (line,) = re.findall(r"^ *(moving = .*)$", EXAMPLE, re.MULTILINE)
+    known, unknown = SimpleNamespace(is_known=True), SimpleNamespace(is_known=False)
+    objects = [SimpleNamespace(motion_state=each, state=known, centroid=each) for each in MotionState]
+    hidden = SimpleNamespace(motion_state=MotionState.DYNAMIC, state=unknown, centroid="nowhere")
+    names: dict[str, object] = {"result": SimpleNamespace(objects=[*objects, hidden])}
+    exec(line, names)  # noqa: S102
+    assert names["moving"] == ["dynamic", "deforming", "unknown"]
 
 
 NO_NETWORK = "segmentation.source=none"

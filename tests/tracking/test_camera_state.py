@@ -54,6 +54,13 @@ def test_prediction_follows_the_twist_and_stops_after_a_fifth_of_a_second() -> N
     assert not later.twist.any() and later.stamp == 3.0
 
 
+@pytest.mark.parametrize("stamp", [0.9, -10.0, math.nan])
+def test_prediction_of_an_earlier_time_is_an_input_error(stamp: float) -> None:
+    """Its covariance would have negative eigenvalues."""
+    with pytest.raises(InputError, match=rf"no prediction for {stamp:.6f} s: the state is of 1\.000000 s;"):
+        state(1.0).predict(stamp)
+
+
 def test_covariance_of_a_prediction_grows_with_time() -> None:
     now = state(0.0)
     torch.testing.assert_close(now.predict(0.0).covariance, now.covariance)

@@ -6,6 +6,7 @@ to the folder of its results. Values that only an expert of one file would chang
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -447,8 +448,8 @@ class OccupancyConfig(Section):
     @field_validator("obstacle_heights")
     @classmethod
     def _check_heights(cls, heights: tuple[float, float]) -> tuple[float, float]:
-        if not heights[0] < heights[1]:
-            raise ValueError("the lowest height should be below the highest")
+        if not -math.inf < heights[0] < heights[1] < math.inf:
+            raise ValueError("the lowest height should be below the highest, and both finite")
         return heights
 
 

@@ -13,6 +13,9 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
 from v3d_torch.types import RGBDFrame, Trajectory
 
+_STOPPABLE_WAIT = 0.1
+"""Longest time of one wait, seconds: a recording can have gaps of minutes, in which `stop` ends the iteration, too."""
+
 
 class RealtimePlayback:
     """Live stream of the frames of a source: each frame arrives at the time of its stamp, relative to the first frame.
@@ -64,7 +67,8 @@ class RealtimePlayback:
         for frame in self._newest_frames(source) if isinstance(source, RGBDSequence) else source:
             if is_first:
                 self._offset, is_first = self._clock.now() - frame.stamp, False
-            self._clock.sleep(self.captured_at(frame) - self._clock.now())
+            while not self._stopped.is_set() and (wait := self.captured_at(frame) - self._clock.now()) > 0:
+                self._clock.sleep(min(wait, _STOPPABLE_WAIT))
             if self._stopped.is_set():
                 return
             yield frame
@@ -74,7 +78,7 @@ class RealtimePlayback:
         return frame.stamp + self._offset
 
     def stop(self) -> None:
-        """End the iteration before its next frame."""
+        """End the iteration before its next frame, within a fraction of a second also in a gap of the recording."""
         self._stopped.set()
 
     def _newest_frames(self, sequence: RGBDSequence) -> Iterator[RGBDFrame]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -49,11 +50,11 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
         heights: Lowest and highest obstacle, metres above the floor; None for those of the configuration.
 
     Raises:
-        ConfigError: If the lowest height is not below the highest.
+        ConfigError: If the lowest height is not below the highest, or a height is not finite.
     """
     size, (low, high) = occupancy.config.voxel_size, heights or occupancy.config.obstacle_heights
-    if not low < high:
-        raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest")
+    if not -math.inf < low < high < math.inf:
+        raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest, both finite")
     T_lw, low, high = level_frame(floor.up), low + floor.offset, high + floor.offset
     occupied = torch.cat(
         [_between(points, T_lw, low, high) for points in occupancy.points_by_chunk(VoxelState.OCCUPIED)]

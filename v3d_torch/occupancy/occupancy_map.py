@@ -9,6 +9,7 @@ from enum import IntEnum
 from typing import Any
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
@@ -145,8 +146,7 @@ class OccupancyMap:
             raise InputError(f"the radius of balls is {radius} m; give a finite radius of at least 0")
         if 2 * radius > self._smallest_extent():  # such a ball touches unknown space; its voxels could be too many
             return torch.zeros(points.shape[:-1], dtype=torch.bool)
-        rows = points.reshape(-1, 3).to(torch.float64)
-        free = are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
+        free = are_balls_free(self.blocks, _rows(points), radius, self.config.voxel_size).reshape(points.shape[:-1])
         # Centres that are not finite, or too far away for integers, touch no voxel.
         return free & (self.states(points) == VoxelState.FREE)
 
@@ -195,7 +195,7 @@ class OccupancyMap:
         """Vectors from the nearest occupied voxels to points, (..., 3), and mask of those not truncated, (...)."""
         if self._nearest is None:
             self._nearest = NearestVoxels(self.occupied_points, self.config.max_distance)
-        nearest, near = self._nearest(points.detach().reshape(-1, 3).to(torch.float64))
+        nearest, near = self._nearest(_rows(points))
         return points.to(torch.float64) - nearest.reshape(points.shape), near.reshape(points.shape[:-1])
 
     def _smallest_extent(self) -> float:
@@ -208,7 +208,7 @@ class OccupancyMap:
 
     def _voxels(self, points: Tensor) -> Tensor:
         """Coordinates of the voxels around points (..., 3), int64, (N, 3)."""
-        return (points.detach().to(torch.float64).reshape(-1, 3) / self.config.voxel_size).floor().to(torch.int64)
+        return (_rows(points) / self.config.voxel_size).floor().to(torch.int64)
 
     def _remove_farthest(self, camera: Tensor) -> None:
         """Remove the blocks farthest from the camera, but no block within the window around the camera."""
@@ -237,3 +237,9 @@ class OccupancyMap:
                 count, self.config.window_radius, self.config.max_blocks, self.config.voxel_size,
             )  # fmt: skip
         self._is_full_window_reported = True
+
+
+def _rows(points: Tensor) -> Tensor:
+    """Points (..., 3) as float64, (N, 3), without their graph."""
+    KORNIA_CHECK_SHAPE(points, ["*", "3"])
+    return points.detach().to(torch.float64).reshape(-1, 3)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.tracking.motion_model import MAX_EXTRAPOLATION
 from v3d_torch.tracking.pose_kalman_filter import join_covariances, predict_covariance
@@ -50,7 +51,15 @@ class CameraState:
 
         Args:
             stamp: Time, seconds, not before that of this state.
+
+        Raises:
+            InputError: If the time is before that of this state, or not a number.
         """
+        if not stamp >= self.stamp:  # the covariance would shrink, and become indefinite
+            raise InputError(
+                f"no prediction for {stamp:.6f} s: the state is of {self.stamp:.6f} s; give a later time, or use"
+                " pose_at, which knows earlier ones"
+            )
         joint = join_covariances(self.covariance, self.cross_covariance, self.twist_covariance)
         moving = min(stamp - self.stamp, MAX_EXTRAPOLATION)
         joint, twist = predict_covariance(joint, self.twist, moving), self.twist

@@ -199,6 +199,37 @@ def test_camera_continues_after_it_was_unplugged(monkeypatch: pytest.MonkeyPatch
     assert 0.1 < after[0].stamp - before[-1].stamp < missing + 0.5
 
 
+def test_camera_that_cannot_be_opened_or_started_again_is_tried_at_intervals(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """librealsense first loses the camera while it is opened; then another program uses it for a second."""
+    monkeypatch.setattr("v3d_torch.datasets.realsense.realsense_camera._RETRY_INTERVAL", 0.2)
+    first, second = SimulatedDevice(), SimulatedDevice()
+    attempts: list[float] = []
+
+    def start() -> None:
+        if time.monotonic() < attempts[0] + 1:
+            raise InputError("simulated: cannot be started")
+        SimulatedDevice.start(second)
+
+    def open_device() -> SimulatedDevice:
+        if not first.unplugged.is_set():
+            return first
+        attempts.append(time.monotonic())
+        if len(attempts) == 1:
+            raise RuntimeError("the device was removed")
+        return second
+
+    monkeypatch.setattr(second, "start", start)
+    frames = iter(RealSenseCamera("simulated", open_device))
+    next(frames)
+    first.unplugged.set()
+    next(frames)
+    frames.close()  # type: ignore[attr-defined]
+    assert second.stopped.is_set() and 2 < len(attempts) < 8
+    assert caplog.text.count("cannot be started") == len(attempts) - 2
+
+
 def test_other_camera_after_an_interruption_is_an_input_error() -> None:
     first, second = SimulatedDevice(), SimulatedDevice()
     second.serial = "2"

@@ -65,6 +65,7 @@ class RealSenseCamera(RealSenseStream):
         index, stamp, arrival = 0, 0.0, 0.0
         while device is not None:
             shift: float | None = None if index else 0.0
+            first_index = index
             with closing(self._images(device)) as images:
                 while (captured := self._next(images, is_first=index == 0)) is not None:
                     now = time.monotonic()
@@ -75,6 +76,8 @@ class RealSenseCamera(RealSenseStream):
                     frame = self._convert_frame(index, stamp, captured)
                     yield frame if index else replace(frame, gravity=gravity)
                     index += 1
+            if index == first_index:  # such as a camera that another program uses: it is there, but cannot be started
+                self._stopped.wait(_RETRY_INTERVAL)
             device = self._reopen(first.serial)
 
     def captured_at(self, frame: RGBDFrame) -> float:
@@ -106,7 +109,7 @@ class RealSenseCamera(RealSenseStream):
         while not self._is_stopped():
             try:
                 device = self._open_device()
-            except InputError:
+            except (InputError, RuntimeError):  # librealsense raises the second one if the camera goes away again
                 self._stopped.wait(_RETRY_INTERVAL)
                 continue
             if device.serial != serial:
