@@ -12,9 +12,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from helpers.batches import plan_seeds
 from helpers.commands import assert_error_line, call_here, invoke
 
 from v3d_torch.batch import ablation_study
+from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.cli.ablate import app
 from v3d_torch.config.loading import CONFIGS, load_config
 from v3d_torch.datasets.tum import TUMSequence
@@ -188,6 +190,16 @@ def test_folder_of_an_earlier_study_is_an_error(
     for count in (2, 3):  # without --out, each study has a folder of its own
         assert call(*arguments, "baseline").exit_code == 0
         assert len(runs.seeds) == count
+
+
+def test_folder_of_a_batch_is_an_error(sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs of a batch have the same folders as those of a study, and would be replaced."""
+    runs = FakeRuns(RuntimeError(), at=99)
+    monkeypatch.setattr(ablation_study, "Run", runs)
+    BatchRecord(plan_seeds(sequence, tmp_path, seeds=1), tmp_path).write()
+    result = call("--seq", sequence, "--variants", "baseline", "--seeds", "1", "--out", tmp_path)
+    assert_error_line(result, f"{tmp_path}: contains a batch; choose another folder with --out")
+    assert not runs.seeds
 
 
 def test_zero_seeds_are_rejected(sequence: Path) -> None:

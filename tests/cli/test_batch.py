@@ -465,6 +465,12 @@ def test_unreadable_sequence_is_error_before_first_run(moment: Path, tmp_path: P
     assert not (tmp_path / "out").exists()
 
 
+def test_option_without_a_value_is_an_error() -> None:
+    """As that of an empty variable of the shell: the next option was taken for its value."""
+    result = call("--seqs", "--configs", "baseline")
+    assert_error_line(result, "--seqs: has no value before --configs; give at least one")
+
+
 def test_configurations_with_same_name_are_rejected(moment: Path, tmp_path: Path) -> None:
     (tmp_path / "paper.yaml").write_text("seed: 0\n")
     result = call("--seqs", moment, "--configs", "paper", tmp_path / "paper.yaml", "--out", tmp_path / "out")

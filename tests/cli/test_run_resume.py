@@ -488,11 +488,16 @@ def remove_processed_frame(folder: Path) -> str:
     return "the frame at 1305031102.200000 s is missing"
 
 
-def add_frame(folder: Path) -> str:
+def add_frame(folder: Path, decimals: str = "150000") -> str:
     for name in ("rgb.txt", "depth.txt"):
         path = folder / name
-        path.write_text(path.read_text() + path.read_text().splitlines()[4].replace(".400000 ", ".150000 ", 1) + "\n")
-    return "the frame at 1305031102.150000 s is new"
+        row = path.read_text().splitlines()[4].replace(".400000 ", f".{decimals} ", 1)
+        path.write_text(f"{path.read_text()}{row}\n")
+    return f"the frame at 1305031102.{decimals} s is new"
+
+
+def add_frame_before_last_processed_frame(folder: Path) -> str:
+    return add_frame(folder, "350000")
 
 
 def cut_before_last_processed_frame(folder: Path) -> str:
@@ -523,8 +528,8 @@ def change_last_image(folder: Path) -> str:
 
 
 CHANGES = (
-    *(shift_timestamps, remove_processed_frame, add_frame, cut_before_last_processed_frame),
-    *(change_camera, change_processed_file, change_last_image),
+    *(shift_timestamps, remove_processed_frame, add_frame, add_frame_before_last_processed_frame),
+    *(cut_before_last_processed_frame, change_camera, change_processed_file, change_last_image),
 )
 
 

@@ -30,6 +30,13 @@ def test_interval_is_that_of_a_paired_t_test_of_logarithms() -> None:
     assert mean_ratio([0.5]).is_significant is False and str(mean_ratio([0.5])) == "0.500"
 
 
+def test_difference_that_is_not_printed_is_not_significant() -> None:
+    """Runs whose errors differ only by rounding are not marked."""
+    ratio = mean_ratio([1 + 1e-9, 1 + 1.1e-9, 1 + 1e-9])
+    assert ratio.low > 1 and str(ratio) == "1.000 [1.000-1.000]"
+    assert not ratio.is_significant
+
+
 def test_interval_contains_the_truth_in_19_of_20_cases() -> None:
     generator = np.random.default_rng(0)
     samples = np.exp(generator.normal(math.log(0.8), 0.3, (2000, 4)))

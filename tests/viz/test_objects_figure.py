@@ -7,6 +7,7 @@ from itertools import combinations
 import torch
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.text import Annotation
 
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
@@ -58,6 +59,14 @@ def draw(table: ObjectTable) -> list[str]:
 def test_objects_have_names_and_dynamic_ones_an_arrow() -> None:
     table = table_of((1, MotionState.STATIC), (2, MotionState.DYNAMIC))
     assert draw(table) == ["person 1", "person 2", ""]
+
+
+def test_arrow_ends_inside_of_the_axes() -> None:
+    """Else it would not be drawn: nothing else is as far away as the object would be a second later."""
+    axes = draw_axes(table_of((1, MotionState.DYNAMIC)))
+    (arrow,) = [text for text in axes.texts if not text.get_text()]
+    assert isinstance(arrow, Annotation)
+    assert axes.bbox.contains(*axes.transData.transform(arrow.xy))
 
 
 def test_names_of_objects_at_the_same_place_do_not_overlap() -> None:

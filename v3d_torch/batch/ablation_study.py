@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
+from v3d_torch.batch.batch_record import RUNS_TABLE
 from v3d_torch.batch.plan import check_configs
 from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config, SegmentationConfig
@@ -89,8 +90,8 @@ def run_ablation_study(
     """Run the study, show and write its tables; arguments as in ``v3d-torch ablate --help``.
 
     Raises:
-        V3DError: If the input is invalid, if the folder contains an earlier study or another study writes to it, if the
-            study was interrupted, or if a run failed. The results of the other runs are written.
+        V3DError: If the input is invalid, if the folder contains an earlier study or a batch, or another study writes
+            to it, if the study was interrupted, or if a run failed. The results of the other runs are written.
     """
     console = wide_console()
     variant_configs = {variant: load_config(_find_variant(variant), overrides) for variant in variants}
@@ -137,8 +138,9 @@ def _run_variants(
         data_root: Folder of named sequences, with which another command finds them again; None for ``$V3D_DATA``.
         console: Console for progress and tables.
     """
-    if (folder / _TABLE).exists():
-        raise InputError(f"{folder}: contains an earlier study; choose another folder with --out")
+    for table, contents in ((_TABLE, "an earlier study"), (RUNS_TABLE, "a batch")):
+        if (folder / table).exists():
+            raise InputError(f"{folder}: contains {contents}; choose another folder with --out")
     outcomes: list[Outcome] = []
     try:
         for name, (source, sequence) in sequences.items():

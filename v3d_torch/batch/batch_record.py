@@ -40,8 +40,8 @@ METRIC_TYPES: Mapping[str, pa.DataType] = {
 The name of a column is the key with ``_`` instead of the dots.
 """
 
-_TABLE = "runs.parquet"
-"""Name of the table of the runs."""
+RUNS_TABLE = "runs.parquet"
+"""Name of the table of the runs, which a batch writes before its first run."""
 
 _SCHEMA = pa.schema(
     [
@@ -71,7 +71,7 @@ class BatchRecord:
     def __init__(self, jobs: Sequence[Job], folder: Path) -> None:
         self.jobs = jobs
         self.folder = folder
-        self._table = folder / _TABLE
+        self._table = folder / RUNS_TABLE
         self._outcomes = {job.folder: outcome for job in jobs if (outcome := job.earlier_outcome()) is not None}
 
     @property
@@ -137,7 +137,7 @@ class BatchRecord:
 
 def has_batch(folder: Path) -> bool:
     """Check whether a folder is that of a batch: it has the table of its runs from the start, or runs."""
-    return (folder / _TABLE).is_file() or next(folder.glob(f"*/*/seed*/{RunFile.LOG}"), None) is not None
+    return (folder / RUNS_TABLE).is_file() or next(folder.glob(f"*/*/seed*/{RunFile.LOG}"), None) is not None
 
 
 def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:

@@ -128,6 +128,9 @@ class MultiValueCommand(PathCommand):
         option = None
         for argument in args:
             if argument.startswith("-"):
+                if option is not None and expanded[-1] == option:  # else, the next option would be its value
+                    with exit_on_error():
+                        raise InputError(f"{option}: has no value before {argument}; give at least one")
                 name = argument.partition("=")[0]
                 option = name if name in repeatable else None
             elif option is not None and expanded[-1] != option:

@@ -21,6 +21,9 @@ from v3d_torch.evaluation.tables import Cell, ErrorTable
 CONFIDENCE = 0.95
 """Confidence of the intervals."""
 
+_DIGITS = 3
+"""Number of printed decimals of a ratio."""
+
 ALL_SEQUENCES = "all sequences"
 """Name of the row with the mean over the sequences."""
 
@@ -41,11 +44,12 @@ class Ratio:
 
     @property
     def is_significant(self) -> bool:
-        """True if the interval does not contain 1."""
-        return self.low > 1 or self.high < 1
+        """True if the interval does not contain 1, as printed: smaller differences are those of rounding."""
+        return round(self.low, _DIGITS) > 1 or round(self.high, _DIGITS) < 1
 
     def __str__(self) -> str:
-        return f"{self.mean:.3f}" + (f" [{self.low:.3f}-{self.high:.3f}]" if math.isfinite(self.low) else "")
+        mean, low, high = (f"{value:.{_DIGITS}f}" for value in (self.mean, self.low, self.high))
+        return mean + (f" [{low}-{high}]" if math.isfinite(self.low) else "")
 
 
 def mean_ratio(ratios: Sequence[float]) -> Ratio:

@@ -174,7 +174,7 @@ def describe_change(checkpoint: Checkpoint, sequence: RGBDStream) -> str | None:
         return "another camera"
     for before, now in zip_longest(stored["stamps"], current["stamps"]):
         if before != now:
-            is_added = before in current["stamps"]
+            is_added = before in sequence.stamps.tolist()  # frames that were added can have moved it beyond the part
             return f"the frame at {now:.6f} s is new" if is_added else f"the frame at {before:.6f} s is missing"
     broken = {frame.index for frame in checkpoint.state["record"].broken}
     for index, (sizes, current_sizes) in enumerate(zip(stored["sizes"], current["sizes"], strict=True)):

@@ -129,8 +129,9 @@ def _draw_object(axes: Axes, objects: ObjectTable, rows: Tensor, R_lw: Tensor, *
         axes.annotate(name, outline.max(axis=0), fontsize=6, color=colours[last], path_effects=rim)
     if colours[last] == MOTION_STATE_COLOURS["dynamic"]:
         x, y = (R_lw @ objects["velocity"][rows][last])[:2].tolist()
-        arrow = {"arrowstyle": "->", "color": colours[last]}
-        axes.annotate("", centroid[last] + (x, y), centroid[last], arrowprops=arrow)
+        tip, arrow = centroid[last] + (x, y), {"arrowstyle": "->", "color": colours[last]}
+        axes.update_datalim([tip])  # an arrow that ends outside of the axes is not drawn
+        axes.annotate("", tip, centroid[last], arrowprops=arrow)
 
 
 def box_outline(box: Tensor, R_lw: Tensor) -> NDArray[np.float64]:
