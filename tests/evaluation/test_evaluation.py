@@ -80,6 +80,8 @@ def test_lost_poses_do_not_indicate_depth_unit() -> None:
     assert "times as large" not in " ".join(evaluate(groundtruth, estimate, is_localised=two).notes)
     with pytest.raises(InputError, match=r"^is_localised has the type torch\.int64; give a mask of type torch\.bool$"):
         evaluate(groundtruth, estimate, is_localised=is_localised.long())
+    with pytest.raises(InputError, match=r"^is_localised has the type list; give a mask of type torch\.bool$"):
+        evaluate(groundtruth, estimate, is_localised=is_localised.tolist())  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"^is_localised has 59 values for 60 poses; give one for each pose$"):
         evaluate(groundtruth, estimate, is_localised=is_localised[1:])
 

@@ -8,18 +8,19 @@ from torch import Tensor
 from v3d_torch.errors import ConfigError, InputError
 
 
-def check_masks(**masks: Tensor | None) -> None:
-    """Check that masks are of type bool: an index by a mask of whole numbers would select other elements.
+def check_masks(**masks: object) -> None:
+    """Check that masks are tensors of type bool: an index by a mask of whole numbers would select other elements.
 
     Args:
         masks: Masks by the name of the argument; None for a mask that was not given.
 
     Raises:
-        InputError: If a mask is not of type bool.
+        InputError: If a mask is no tensor, or not of type bool.
     """
     for name, mask in masks.items():
-        if mask is not None and mask.dtype != torch.bool:
-            raise InputError(f"{name} has the type {mask.dtype}; give a mask of type torch.bool")
+        given = mask.dtype if isinstance(mask, Tensor) else type(mask).__name__
+        if mask is not None and given != torch.bool:
+            raise InputError(f"{name} has the type {given}; give a mask of type torch.bool")
 
 
 def check_positive(**numbers: Tensor | float) -> None:
