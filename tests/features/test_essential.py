@@ -96,6 +96,19 @@ def test_pairs_with_a_pixel_that_is_not_finite_are_padding(value: float) -> None
             assert torch.autograd.grad(found.E.sum(), K)[0].isfinite().all()
 
 
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_problem_with_a_singular_camera_matrix_is_padding(value: float) -> None:
+    a, b, _ = two_views(outliers=100)
+    K = torch.stack([CAMERA.K, torch.full((3, 3), value, dtype=torch.float64)]).requires_grad_()
+    found = essential_ransac(a.uv, b.uv, K)
+    expected = essential_ransac(a.uv, b.uv, CAMERA.K)
+    assert found.found.tolist() == [True, False]
+    assert torch.equal(found.E[0], expected.E) and torch.equal(found.inliers[0], expected.inliers)
+    assert not found.E[1].any() and not found.inliers[1].any()
+    found.E.sum().backward()
+    assert K.grad is not None and K.grad[0].isfinite().all() and not K.grad[1].any()
+
+
 def test_negative_weight_is_an_error() -> None:
     a, b, _ = two_views()
     weights = torch.ones(400)

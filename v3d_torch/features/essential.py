@@ -77,7 +77,7 @@ def essential_ransac(
 
     Returns:
         Matrices with the dtype of ``uv_a``, float32 for integers; their sign is arbitrary. No matrix is found from
-        fewer than 6 pairs, or than 8 if torch computes the hypotheses.
+        fewer than 6 pairs, or than 8 if torch computes the hypotheses, or with a singular ``K``, as that of padding.
 
     Raises:
         InputError: If ``valid`` is not bool, or a weight is negative or NaN.
@@ -93,12 +93,15 @@ def essential_ransac(
         weights = torch.ones_like(uv_a[..., 0])
     else:
         check_weights(weights, valid)
+    K = K.to(torch.float64)
+    is_regular = torch.linalg.det(K.detach()).abs()[..., None] > 0  # false for NaN, too
+    K = torch.where(is_regular[..., None], K, torch.eye(3, dtype=K.dtype, device=K.device))
     batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], weights.shape[:-1], valid.shape[:-1])
-    mask, row = valid.expand(*batch, -1), valid[..., None]
+    mask, row = (valid & is_regular).expand(*batch, -1), valid[..., None]
     problem = EpipolarProblem(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),
         b=_homogeneous(fill_padding(uv_b, row, 0.0).expand(*batch, -1, 2)),
-        K_inverse=torch.linalg.inv(K.to(torch.float64)).expand(*batch, 3, 3),
+        K_inverse=torch.linalg.inv(K).expand(*batch, 3, 3),
         weights=fill_padding(weights, valid, 0.0).expand(*batch, -1),
     )
     constant = EpipolarProblem(*(each.detach() for each in problem))
