@@ -29,7 +29,7 @@ from v3d_torch.evaluation.ablation import (
 )
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.io.files import write_text
-from v3d_torch.io.paths import folder_name
+from v3d_torch.io.names import folder_name
 from v3d_torch.io.text import describe_error
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.file_names import RunFile

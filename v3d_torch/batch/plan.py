@@ -12,7 +12,8 @@ from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.locate import data_root_of
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import ConfigError
-from v3d_torch.io.paths import expand_user, folder_name
+from v3d_torch.io.names import folder_name
+from v3d_torch.io.paths import expand_user
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import import_stage
 from v3d_torch.segmentation import make_instance_source

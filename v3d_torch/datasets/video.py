@@ -22,7 +22,7 @@ from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, check_paired
 from v3d_torch.errors import InputError
 from v3d_torch.io.download import Progress
-from v3d_torch.io.paths import path_label
+from v3d_torch.io.names import path_label
 from v3d_torch.io.timestamps import associate
 from v3d_torch.types import RGBDFrame
 

@@ -1,4 +1,4 @@
-"""Expansion of ``~`` to the home folder in paths given by users, the cache folder, and names of sources and results.
+"""Paths given by users, with ``~`` for the home folder, and the cache folder.
 
 Shells expand ``~`` in ``--out ~/x``, but not in ``--out=~/x``, in environment variables in quotes, or in Python.
 """
@@ -38,14 +38,3 @@ def expand_user_paths(command: Callable[..., None]) -> Callable[..., None]:
         command(**{name: expand_user(value) if isinstance(value, Path) else value for name, value in options.items()})
 
     return expanded
-
-
-def path_label(path: Path) -> str:
-    """Return the name of a folder, or that of a file without its suffix: a dot in the name of a folder is no suffix."""
-    resolved = path.resolve()
-    return resolved.name if resolved.is_dir() else resolved.stem
-
-
-def folder_name(name: str) -> str:
-    """Return the name of a sequence as the name of one folder: ``fr3/w/xyz`` and ``demo:sitting`` are no folders."""
-    return name.replace("/", "_").replace(":", "_")

@@ -11,7 +11,7 @@ from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
 from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
-from v3d_torch.io.paths import folder_name
+from v3d_torch.io.names import folder_name
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from v3d_torch.errors import LockedError, OutputError
-from v3d_torch.io.paths import folder_name
+from v3d_torch.io.names import folder_name
 from v3d_torch.runs.file_names import FIGURES, MAP_MASKS, MASKS, RunFile
 
 _LOCK = ".run.lock"

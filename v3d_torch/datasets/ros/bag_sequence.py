@@ -26,7 +26,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_scale import MILLIMETRES
 from v3d_torch.io.download import Progress
-from v3d_torch.io.paths import path_label
+from v3d_torch.io.names import path_label
 from v3d_torch.io.text import first_line
 from v3d_torch.io.timestamps import associate
 
