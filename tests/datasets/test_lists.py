@@ -49,6 +49,15 @@ def test_associations_with_spaces_in_file_names_are_read(
     assert found == [first[stamp] for stamp in sorted(first)]
 
 
+def test_poses_after_the_second_file_are_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "associations.txt"
+    lines = ["10.0 rgb/a.png 10.0 depth/a 1.png", "10.5 rgb/b.png 10.5 depth/b 2.png"]
+    path.write_text("\n".join(lines))
+    expected = read_associations(path)
+    path.write_text("\n".join(f"{line} 10.01 1.34 0.63 1.66 0.66 0.61 -2.9e-01 -0.32" for line in lines))
+    assert read_associations(path) == expected
+
+
 def test_depth_delay_is_depth_stamp_minus_colour_stamp(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("10.0 rgb/a.png\n10.5 rgb/b.png\n")
     (tmp_path / "depth.txt").write_text("9.984375 depth/a.png\n10.515625 depth/b.png\n")

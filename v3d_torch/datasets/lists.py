@@ -86,7 +86,8 @@ def read_associations(path: Path) -> tuple[list[ImagePair], str | None]:
     """Read a list with lines of ``stamp file stamp file``.
 
     Both orders are in use, colour first and depth first. The image headers of the first line with a colour and a depth
-    image decide between them.
+    image decide between them. Numbers after the second file are ignored: a pose that the TUM benchmark's association
+    tool appended.
 
     Args:
         path: Path of the list, in the sequence's folder.
@@ -101,18 +102,17 @@ def read_associations(path: Path) -> tuple[list[ImagePair], str | None]:
     rows = []
     for number, line in numbered_lines(path, _EXPECTED):
         words = list(re.finditer(r"[^\s,]+", line))
-        # File names can contain spaces: the second stamp is a number that follows a file suffix.
-        middle = next(
-            (i for i in range(2, len(words) - 1) if _is_second_stamp(words[i - 1][0], words[i][0])),
-            None,
-        )
-        if middle is None:
+        # File names can contain spaces: the stamp after one is a number that follows a file suffix.
+        after_files = [i for i in range(2, len(words)) if _is_stamp_after_file(words[i - 1][0], words[i][0])]
+        middle, end, *_ = [*after_files, len(words), len(words)]
+        if middle + 1 >= end:
             raise InputError(
                 f"{path}: line {number} is {line[:80]!r}, expected timestamp, file, timestamp, file; correct it, or"
                 " remove this list and use rgb.txt and depth.txt"
             )
         first, second = words[0][0], words[middle][0]
-        listed = (line[words[1].start() : words[middle - 1].end()], line[words[middle + 1].start() :])
+        files = words[1:middle], words[middle + 1 : end]
+        listed = [line[each[0].start() : each[-1].end()] for each in files]
         names = [_find_file(path.parent, name) for name in listed]
         rows.append((_parse_stamp(first, path, number), names[0], _parse_stamp(second, path, number), names[1]))
     if _is_depth_first(path.parent, rows):
@@ -252,8 +252,8 @@ def _is_depth_first(folder: Path, rows: Iterable[tuple[float, str, float, str]])
     return next((first for first, second in pairs if first != second), False)
 
 
-def _is_second_stamp(previous: str, word: str) -> bool:
-    """Check whether a word is the timestamp between two file names."""
+def _is_stamp_after_file(previous: str, word: str) -> bool:
+    """Check whether a word is a timestamp after a file name."""
     is_number = re.fullmatch(r"[-+\d.e]+", replace_odd_spaces(word)) is not None
     return is_number and re.search(r"\.\w+$", replace_odd_spaces(previous)) is not None
 
