@@ -222,7 +222,7 @@ class MotionClassifier:
     def _rigid_references(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
         """Return the rigid objects that have most of the inliers: people move some of their parts, and not others."""
         flags = zip(tracks, have_most_inliers.tolist(), strict=True)
-        return {track for track, has_most in flags if has_most and track.label in RIGID and not track.may_be_living}
+        return {track for track, has_most in flags if has_most and track.is_rigid}
 
     def _motion_state(self, track: Track, appeared: list[float], stamp: float) -> MotionState:
         """Return the motion state of an object.

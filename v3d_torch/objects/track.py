@@ -157,11 +157,16 @@ class Track:
 
     @property
     def may_move(self) -> bool:
-        """True if the object may move by itself or has moved; false for furniture that was always at rest.
+        """True if the object may move by itself or has moved; false for furniture that was always at rest."""
+        return not self.is_rigid or self.last_dynamic > -torch.inf
+
+    @property
+    def is_rigid(self) -> bool:
+        """True for furniture and other things, which move as a whole or not at all.
 
         A person at the border of the image is often detected as furniture.
         """
-        return self.label not in RIGID or self.may_be_living or self.last_dynamic > -torch.inf
+        return self.label in RIGID and not self.may_be_living
 
     @property
     def may_be_living(self) -> bool:
