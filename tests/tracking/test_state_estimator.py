@@ -74,6 +74,17 @@ def test_jump_of_a_camera_that_is_found_again_is_not_a_twist() -> None:
             assert state.twist.norm() < 0.01
 
 
+def test_jump_of_a_camera_that_is_found_again_at_once_is_no_noise() -> None:
+    """The frame after the jump is relocalised, so that no frame between them has a pose from its motion."""
+    camera, away = SteadyCamera(), se3_exp(torch.tensor([2.0, 0, 0, 0, 0, 0], dtype=torch.float64))
+    for _ in range(10):
+        before = camera(tracked()).covariance
+    camera(replace(tracked(away), is_relocalised=True), is_measured=False)
+    for _ in range(10):
+        after = camera(tracked(away)).covariance
+    assert (after.diagonal() <= before.diagonal()).all()
+
+
 def test_covariance_of_a_camera_not_yet_found_is_that_of_an_unknown_pose_at_any_time() -> None:
     camera, start = SteadyCamera(), 1.3e9
     state = camera(frame_pose(EYE, TrackingStatus.LOST), is_measured=False, start=start)

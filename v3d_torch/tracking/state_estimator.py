@@ -74,6 +74,8 @@ class StateEstimator:
         """
         stamp, T_wc, status = poses.stamp, invert(poses.T_cw), poses.status or pose.status
         defines_world = status is TrackingStatus.TRACKED and pose.information is None  # the first keyframe
+        if pose.is_relocalised:  # it can have jumped, even if the previous frame was found
+            self._pose_noise.interrupt()
         if pose.information is not None:
             self._covariance = self._track(pose.information, stamp, T_wc, owners)
             if status is TrackingStatus.DISCONNECTED:
