@@ -10,6 +10,7 @@ from helpers.bundle_scenes import CAMERA, Scene
 from helpers.rolling_camera import KINECT
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.mapping.readout_calibration import combine_readouts, estimate_readout
@@ -76,3 +77,12 @@ def test_change_that_a_pose_explains_keeps_the_estimate(noise: float) -> None:
     assert (float(seconds), float(information)) == (0.02, 1e4)
     uv_jacobian[::2] = 0
     assert estimate_readout(0.02, 1e4, *state, **scene.observations)[1] > 1e4
+
+
+@pytest.mark.parametrize("shape", [(1, 2), (2,), (40, 2), (120, 1)])
+def test_readout_jacobian_of_another_shape_is_rejected(shape: tuple[int, ...]) -> None:
+    """One row was used for all observations."""
+    scene = Scene(poses=4, points=40, observers=3)
+    assert len(scene.pose) == 120
+    with pytest.raises(ShapeError):
+        estimate_readout(0.02, 1e3, torch.ones(shape), scene.T_cw, scene.points, **scene.observations)

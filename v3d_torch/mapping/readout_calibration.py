@@ -9,6 +9,7 @@ estimate of the readout, and its curvature is the information of that estimate.
 from __future__ import annotations
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.camera import MAX_READOUT
@@ -91,9 +92,10 @@ def estimate_readout(
 
     Raises:
         InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, if a
-            pose or landmark is not finite, or if a weight is negative or NaN.
+            pose or landmark is not finite, or if a weight is negative, infinite or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
+    KORNIA_CHECK_SHAPE(readout_jacobian, ["*", str(pose.shape[-1]), "2"])
     batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
     problem, state, valid = prepare_bundle(
