@@ -116,6 +116,15 @@ def test_weight_that_is_negative_or_nan_is_an_error(value: float) -> None:
         bundle_adjust(**inputs)
 
 
+def test_infinite_weight_is_an_error_unless_it_is_padding() -> None:
+    inputs = bundle()
+    inputs["weights"][:, 0] = torch.inf
+    assert bundle_adjust(**inputs).cost_after.isfinite().all()
+    inputs["weights"][:, 3] = torch.inf
+    with pytest.raises(InputError, match="weights has an infinite value; give finite weights"):
+        bundle_adjust(**inputs)
+
+
 @pytest.mark.parametrize("name", ["inverse_depth", "weights", "valid", "fixed"])
 def test_wrong_number_of_values_is_rejected(name: str) -> None:
     with pytest.raises(ShapeError):

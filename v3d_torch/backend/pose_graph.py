@@ -107,7 +107,7 @@ def optimise_pose_graph(
 
     Raises:
         InputError: If ``edges`` is not int64, or has an index out of range, if a mask is not bool, if a pose or an
-            information matrix is not finite, or if a weight is negative or NaN.
+            information matrix is not finite, or if a weight is negative, infinite or NaN.
         ConfigError: If ``robust`` is not positive.
     """
     check_masks(fixed=fixed, valid=valid)

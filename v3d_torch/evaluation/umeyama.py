@@ -49,7 +49,7 @@ def umeyama(
         scale, which is then 1. It is NaN if a point is not finite.
 
     Raises:
-        InputError: If ``valid`` is not bool, or if a weight is negative or NaN.
+        InputError: If ``valid`` is not bool, or if a weight is negative, infinite or NaN.
     """
     check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])

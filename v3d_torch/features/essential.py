@@ -80,7 +80,7 @@ def essential_ransac(
         fewer than 6 pairs, or than 8 if torch computes the hypotheses, or with a singular ``K``, as that of padding.
 
     Raises:
-        InputError: If ``valid`` is not bool, or a weight is negative or NaN.
+        InputError: If ``valid`` is not bool, or a weight is negative, infinite or NaN.
         ConfigError: If ``threshold`` or ``iterations`` is not positive.
     """
     check_masks(valid=valid)

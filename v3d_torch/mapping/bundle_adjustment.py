@@ -118,7 +118,7 @@ def bundle_adjust(
 
     Raises:
         InputError: If ``pose`` or ``point`` is not int64 or has an index out of range, if a mask is not bool, if a pose
-            or landmark is not finite, or if a weight is negative or NaN.
+            or landmark is not finite, or if a weight is negative, infinite or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     problem, initial, valid = prepare_bundle(

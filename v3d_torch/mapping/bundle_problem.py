@@ -217,7 +217,7 @@ def prepare_bundle(
 
     Raises:
         InputError: If a mask is not bool, an index is not int64 or out of range, a pose or point is not finite, or a
-            weight is negative or NaN.
+            weight is negative, infinite or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     check_masks(fixed=fixed, valid=valid)

@@ -190,7 +190,7 @@ def refine_pose(
         least in float32. A pose without measurements is the prediction.
 
     Raises:
-        InputError: If ``valid`` is not bool, or a weight is negative or NaN.
+        InputError: If ``valid`` is not bool, or a weight is negative, infinite or NaN.
         ConfigError: If ``rounds``, or a standard deviation that is a number, is not positive.
 
     Example:

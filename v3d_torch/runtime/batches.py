@@ -72,17 +72,21 @@ def check_finite_arguments(**values: Tensor) -> None:
 
 
 def check_weights(weights: Tensor, valid: Tensor) -> None:
-    """Check that weights are not negative, if they can be read at once: with others, a cost has no minimum.
+    """Check that weights are finite and not negative, if they can be read at once: with others, a cost has no minimum.
 
     Args:
         weights: Weights of the measurements.
         valid: Mask of the measurements that are not padding, bool, a shape that broadcasts.
 
     Raises:
-        InputError: If the weight of a measurement is negative or NaN.
+        InputError: If the weight of a measurement is negative, infinite or NaN.
     """
-    if can_read(weights) and can_read(valid) and bool((~(weights >= 0) & valid).any()):
+    if not (can_read(weights) and can_read(valid)):
+        return
+    if bool((~(weights >= 0) & valid).any()):
         raise InputError("weights has a value that is negative or NaN; give weights of at least 0")
+    if bool((weights.isinf() & valid).any()):
+        raise InputError("weights has an infinite value; give finite weights")
 
 
 def common_batch(*batches: torch.Size) -> torch.Size:
