@@ -356,7 +356,8 @@ class V3DSLAM(FramePreprocessor):
         The objects of the state are shared, not copied.
 
         Raises:
-            ConfigError: If the state lacks a part, for example because it was saved without an occupancy map.
+            ConfigError: If the state lacks a part, for example because it was saved without an occupancy map, or if the
+                segmenter cannot load its state.
         """
         missing = sorted(self.state_dict().keys() - state.keys())
         if missing:
