@@ -151,8 +151,13 @@ class V3DSLAM(FramePreprocessor):
         self.up_estimator = UpEstimator()
         self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
-        self._segmenter_state = segmenter_state_of(self.segment)
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute, see `ReplaceableStages`; the state of a new segmenter replaces that of the one before."""
+        super().__setattr__(name, value)
+        if name == "segment":
+            self._segmenter_state = segmenter_state_of(value)
 
     @property
     def gravity(self) -> Tensor | None:
