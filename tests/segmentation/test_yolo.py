@@ -130,9 +130,10 @@ def test_onnx_file_of_the_user_keeps_its_input_size(tmp_path: Path) -> None:
     path = exported_path("yolo26n-seg", find_weights("yolo26n-seg"), 320, 320)
     user_file = tmp_path / "mine.onnx"
     user_file.write_bytes(path.read_bytes())
-    segmenter = YOLOSegmenter(SegmentationConfig(model="yolo26n-seg", threads=1), weights=user_file)
-    assert (segmenter.height, segmenter.width) == (320, 320)
-    assert segmenter.segment(photograph("astronaut")).labels[0] == PERSON
+    for weights in (user_file, str(user_file)):
+        segmenter = YOLOSegmenter(SegmentationConfig(model="yolo26n-seg", threads=1), weights=weights)
+        assert (segmenter.height, segmenter.width) == (320, 320)
+        assert segmenter.segment(photograph("astronaut")).labels[0] == PERSON
 
 
 def test_onnx_file_with_an_upper_case_suffix_is_read(tmp_path: Path) -> None:

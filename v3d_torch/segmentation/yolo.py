@@ -10,6 +10,7 @@ from torch import Tensor
 from v3d_torch.config import SegmentationConfig
 from v3d_torch.errors import InputError
 from v3d_torch.features.brightness import brighten
+from v3d_torch.io.paths import StrPath
 from v3d_torch.runtime.input_checks import describe_wrong_tensor
 from v3d_torch.segmentation.decode import decode
 from v3d_torch.segmentation.export import exported_path
@@ -38,7 +39,8 @@ class YOLOSegmenter:
         WeightsError: If the weights are missing, damaged or of another network.
     """
 
-    def __init__(self, config: SegmentationConfig, weights: Path | None = None) -> None:
+    def __init__(self, config: SegmentationConfig, weights: StrPath | None = None) -> None:
+        weights = None if weights is None else Path(weights)
         if weights is not None and weights.suffix.lower() == ".onnx":
             self._network: WholeNetwork | SplitNetwork = WholeNetwork(weights, config.threads)
         else:
