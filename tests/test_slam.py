@@ -33,7 +33,7 @@ from v3d_torch.occupancy.floor import Floor
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter, make_segmenter
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
-from v3d_torch.types import FramePose, TrackingStatus
+from v3d_torch.types import FramePose, Instances, TrackingStatus
 
 NO_NETWORK = load_config(None, ("segmentation.source=none",))
 
@@ -62,6 +62,17 @@ def test_segmenter_of_the_config_equals_the_same_segmenter_as_an_argument(demo: 
     configured, passed = V3DSLAM(demo.camera, config=NO_NETWORK), V3DSLAM(demo.camera, NoSegmentation(), NO_NETWORK)
     for index in range(3):
         assert torch.equal(configured(demo[index]).T_wc, passed(demo[index]).T_wc)
+
+
+def test_segmenter_that_is_an_empty_list_is_used(demo: RGBDSequence) -> None:
+    class Recorder(list[int]):
+        def __call__(self, frame: RGBDFrame) -> Instances:
+            self.append(frame.index)
+            return Instances.empty(*frame.image.shape[1:])
+
+    recorder = Recorder()
+    V3DSLAM(demo.camera, recorder)(demo[0])
+    assert recorder == [0]
 
 
 def test_moving_regions_become_objects_without_a_network(demo: RGBDSequence) -> None:

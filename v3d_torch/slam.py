@@ -151,8 +151,13 @@ class V3DSLAM(FramePreprocessor):
         self.up_estimator = UpEstimator()
         self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
-        self._segmenter_state = segmenter_state_of(self.segment)
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute, see `ReplaceableStages`; the state of a new segmenter replaces that of the one before."""
+        super().__setattr__(name, value)
+        if name == "segment":
+            self._segmenter_state = segmenter_state_of(value)
 
     @property
     def gravity(self) -> Tensor | None:
@@ -356,7 +361,8 @@ class V3DSLAM(FramePreprocessor):
         The objects of the state are shared, not copied.
 
         Raises:
-            ConfigError: If the state lacks a part, for example because it was saved without an occupancy map.
+            ConfigError: If the state lacks a part, for example because it was saved without an occupancy map, or if the
+                segmenter cannot load its state.
         """
         missing = sorted(self.state_dict().keys() - state.keys())
         if missing:

@@ -169,9 +169,9 @@ class Instances:
         return self.labels.shape[0]
 
     def __getitem__(self, selected: Tensor) -> Instances:
-        """Select instances by a boolean mask; returns self when everything is selected, to avoid copying masks."""
-        if bool(selected.all()):
-            return self
+        """Select instances by a boolean mask, which returns self if everything is selected, or by indices from 0."""
+        if selected.dtype == torch.bool and bool(selected.all()):
+            return self  # avoids a copy of the masks
         track_ids = None if self.track_ids is None else self.track_ids[selected]
         masks, boxes = self.masks[selected], self.boxes[selected]
         return Instances(masks, self.labels[selected], self.scores[selected], boxes, track_ids)

@@ -71,6 +71,16 @@ def test_state_from_before_the_first_frame_also_restores_the_segmenter() -> None
     assert list(differences(votes, segmenter_state_of(slam.segment), "votes", {})) == []
 
 
+def test_state_after_the_segmenter_is_replaced_is_that_of_the_new_one() -> None:
+    walk, slam = Walk(), V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG)
+    slam(walk[0])
+    slam.segment = UprightSegmenter(segment_red)
+    votes = segmenter_state_of(slam.segment)
+    assert list(differences(votes, slam.state_dict()["segmenter"], "votes", {})) == []
+    slam.segment = segment_red
+    assert slam.state_dict()["segmenter"] is None
+
+
 def test_segmenter_of_one_system_does_not_change_the_results_of_another() -> None:
     walk, first, alone = Walk(), *(V3DSLAM(CAMERA, UprightSegmenter(segment_red), CONFIG) for _ in range(2))
     first(walk[0])

@@ -58,6 +58,15 @@ def test_invalid_labels_are_one_sentence(tmp_path: Path, text: str) -> None:
         MaskFolder(tmp_path)
 
 
+@pytest.mark.parametrize("text", ["0: person\n56: chair\n", "-1: cup\n"])
+def test_label_of_the_background_is_rejected(tmp_path: Path, text: str) -> None:
+    """Ids that are class indices have people as 0, who would be part of the background."""
+    Image.fromarray(ids(np.uint8, 4)).save(tmp_path / "a.png")
+    (tmp_path / "labels.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"labels\.yaml: has the id (0|-1), but 0 is the background; number"):
+        MaskFolder(tmp_path)
+
+
 def test_ids_of_a_palette_image_are_its_palette_indices(tmp_path: Path) -> None:
     image = Image.fromarray(ids(np.uint8, 3)).convert("P")
     image.putpalette([value for index in range(256) for value in (255 - index, index, 0)])

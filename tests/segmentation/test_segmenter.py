@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import pytest
 import torch
 from helpers.tilted_frames import IDENTITY, Network, make_frame
 from torch import nn
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation.segmenter import (
     PoseAwareSegmenter,
@@ -64,3 +68,38 @@ def test_methods_forwarded_by_a_proxy_are_used() -> None:
     assert segment_frame(proxy, make_frame(0, 1), IDENTITY).labels.tolist() == [0]
     state = segmenter_state_of(proxy)
     assert state is not None and state["calls"] == 1
+
+
+class Counter:
+    """Segmenter whose state shares a list with it, as the states of the stages do."""
+
+    def __init__(self) -> None:
+        self.indices: list[int] = []
+
+    def __call__(self, frame: RGBDFrame) -> Instances:
+        self.indices.append(frame.index)
+        return Instances.empty(*frame.image.shape[1:])
+
+    def state_dict(self) -> dict[str, list[int]]:
+        return {"indices": self.indices}
+
+    def load_state_dict(self, state: Mapping[str, list[int]]) -> None:
+        self.indices = state["indices"]
+
+
+def test_state_does_not_change_when_later_frames_are_segmented() -> None:
+    counter, resumed = Counter(), Counter()
+    counter(make_frame(0, 0))
+    state = segmenter_state_of(counter)
+    counter(make_frame(1, 0))
+    assert state == {"indices": [0]}
+    restore_segmenter(resumed, state)
+    resumed(make_frame(1, 0))
+    assert state == {"indices": [0]} and resumed.indices == [0, 1]
+
+
+def test_state_of_another_segmenter_is_an_error_that_names_the_cause() -> None:
+    state = segmenter_state_of(UprightSegmenter(Network()))
+    message = r"^the segmenter, a Counter, cannot load the saved state \(KeyError: 'indices'\); give the segmenter with"
+    with pytest.raises(ConfigError, match=message):
+        restore_segmenter(Counter(), state)

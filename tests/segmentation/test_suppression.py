@@ -213,3 +213,10 @@ def test_instances_without_duplicates_are_not_copied() -> None:
     assert suppress_duplicates(all_, MAX_OVERLAP) is all_
     assert all_.concatenate(Instances.empty(HEIGHT, WIDTH)) is all_
     assert len(all_[torch.tensor([False, True])]) == 1
+
+
+def test_instances_are_selected_by_indices_as_suppression_of_other_libraries_returns_them() -> None:
+    all_ = instances([WHOLE, OTHER], [PERSON, CHAIR])
+    for indices, labels in (([1], [CHAIR]), ([1, 0], [CHAIR, PERSON]), ([], [])):
+        selected = all_[torch.tensor(indices, dtype=torch.int64)]
+        assert selected.labels.tolist() == labels and len(selected.masks) == len(labels)

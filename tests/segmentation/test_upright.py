@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 from helpers.tilted_frames import HEIGHT, IDENTITY, WIDTH, Network, make_frame
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.segmentation.segmenter import segmenter_state_of
 from v3d_torch.segmentation.upright import UprightSegmenter, up_votes
+from v3d_torch.types import Instances
 
 
 def rolled(degrees: float) -> Tensor:
@@ -33,6 +36,22 @@ def test_instances_are_in_the_orientation_of_the_frame(turns: int) -> None:
     rows, columns = torch.nonzero(instances.masks[0], as_tuple=True)
     edges = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
     assert instances.boxes.tolist() == [[float(edge) for edge in edges]]
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (None, "the segmenter returned a NoneType for frame 3; it must return Instances"),
+        (Instances.empty(HEIGHT + 1, WIDTH), r"masks for frame 3 are torch.bool of shape \(0, 25, 32\)"),
+        (
+            replace(Network()(make_frame(3, 0)), scores=torch.tensor([torch.nan])),
+            "scores for frame 3 have values that are not from 0 to 1",
+        ),
+    ],
+)
+def test_invalid_instances_of_the_wrapped_segmenter_are_rejected(returned: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        UprightSegmenter(lambda _: returned).segment_with_pose(make_frame(3, 0), IDENTITY)
 
 
 @pytest.mark.parametrize("start", [0, 1, 2, 3])

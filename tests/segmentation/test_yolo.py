@@ -14,10 +14,11 @@ from helpers.library_settings import default_dtype, torch_threads
 from helpers.photographs import photograph
 from onnx import TensorProto, helper
 from PIL import Image, ImageDraw
+from torch import Tensor
 
 import v3d_torch.segmentation.yolo
 from v3d_torch.config import SegmentationConfig
-from v3d_torch.errors import WeightsError
+from v3d_torch.errors import InputError, WeightsError
 from v3d_torch.segmentation import COCO_NAMES, PERSON, YOLOSegmenter
 from v3d_torch.segmentation.export import exported_path
 from v3d_torch.segmentation.upright import UprightSegmenter
@@ -129,9 +130,32 @@ def test_onnx_file_of_the_user_keeps_its_input_size(tmp_path: Path) -> None:
     path = exported_path("yolo26n-seg", find_weights("yolo26n-seg"), 320, 320)
     user_file = tmp_path / "mine.onnx"
     user_file.write_bytes(path.read_bytes())
-    segmenter = YOLOSegmenter(SegmentationConfig(model="yolo26n-seg", threads=1), weights=user_file)
-    assert (segmenter.height, segmenter.width) == (320, 320)
-    assert segmenter.segment(photograph("astronaut")).labels[0] == PERSON
+    for weights in (user_file, str(user_file)):
+        segmenter = YOLOSegmenter(SegmentationConfig(model="yolo26n-seg", threads=1), weights=weights)
+        assert (segmenter.height, segmenter.width) == (320, 320)
+        assert segmenter.segment(photograph("astronaut")).labels[0] == PERSON
+
+
+def test_onnx_file_with_an_upper_case_suffix_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "MINE.ONNX"
+    path.write_bytes(exported_path("yolo26n-seg", find_weights("yolo26n-seg"), 320, 320).read_bytes())
+    assert YOLOSegmenter(SegmentationConfig(threads=1), weights=path).height == 320
+
+
+@pytest.mark.parametrize(
+    ("convert", "message"),
+    [
+        (lambda image: image / 255, r"torch.float32 of shape \(3, 512, 512\), expected a tensor, torch.uint8 of shape"),
+        (lambda image: image.permute(1, 2, 0), r"torch.uint8 of shape \(512, 512, 3\), expected"),
+        (lambda image: image[:1], r"torch.uint8 of shape \(1, 512, 512\), expected"),
+        (lambda image: image.numpy(), "a ndarray, expected a tensor"),
+    ],
+)
+def test_images_that_are_not_rgb_in_uint8_are_rejected(convert: Callable[[Tensor], object], message: str) -> None:
+    """The network finds nothing in an image from 0 to 1, which it takes for a black one."""
+    segmenter = YOLOSegmenter(SegmentationConfig(threads=1))
+    with pytest.raises(InputError, match=f"^the image to segment is {message}"):
+        segmenter.segment(convert(photograph("astronaut")))  # type: ignore[arg-type]
 
 
 def test_network_is_exported_once_for_each_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

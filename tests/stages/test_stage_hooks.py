@@ -197,3 +197,16 @@ def test_weights_of_a_hooked_network_are_not_state(system: type[V3DSLAM]) -> Non
     assert slam.segment_instances(frame, None).segmenter_state is None
     slam.register_stage_hook("segment", lambda *_: None)
     assert slam.segment_instances(replace(frame), None).segmenter_state is None
+
+
+@pytest.mark.parametrize("stage", ["segment", "smooth_depth"])
+def test_stage_of_another_system_has_only_the_hooks_of_its_system(stage: str) -> None:
+    walk, first, second = Walk(), *(V3DSLAM(CAMERA, segment_red, CONFIG) for _ in range(2))
+    called: list[str] = []
+    first.register_stage_hook(stage, lambda *_: called.append("first"))
+    setattr(first, stage, getattr(first, stage))
+    setattr(second, stage, getattr(first, stage))
+    first(walk[0]), second(walk[0])
+    assert called == ["first"]
+    V3DSLAM(CAMERA, first.segment, CONFIG)(walk[0])
+    assert called == ["first"]

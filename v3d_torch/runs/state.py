@@ -66,7 +66,8 @@ def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesCo
             word of a file alone.
 
     Raises:
-        ConfigError: If the configuration has import paths that ``stages`` does not have, or a stage cannot be made.
+        ConfigError: If the configuration has import paths that ``stages`` does not have, or a stage cannot be made; or
+            if the segmenter cannot load its state, which is that of another one.
         InputError: If the file is missing, damaged, not a saved state, or from another version.
         WeightsError: If the weights of the network are not available.
     """

@@ -41,3 +41,8 @@ class HookedStage(StageProxy):
         value = super().__getattr__(name)
         # Segmenters that use the pose are called by this method.
         return HookedStage(value, self._name, self._hooks) if name == "segment_with_pose" else value
+
+
+def without_hooks(stage: Any) -> Any:
+    """Return a stage without the hooks of the system from which it was read."""
+    return stage._stage if type(stage) is HookedStage else stage

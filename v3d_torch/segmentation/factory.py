@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.paths import StrPath
 from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.segmentation.mask_files import MaskFolder
 from v3d_torch.segmentation.upright import UprightSegmenter
@@ -23,7 +22,7 @@ class NoSegmentation:
 
 
 def make_segmenter(
-    config: Config, camera: PinholeCamera, weights: Path | None = None, masks_dir: Path | None = None
+    config: Config, camera: PinholeCamera, weights: StrPath | None = None, masks_dir: StrPath | None = None
 ) -> Segmenter:
     """Create the segmenter for one run: the one with the import path ``stages.segment``, else that of the package.
 
@@ -87,7 +86,7 @@ def wrap_upright(source: Segmenter, config: SegmentationConfig) -> Segmenter:
 
 
 def make_instance_source(
-    config: SegmentationConfig, weights: Path | None = None, masks_dir: Path | None = None
+    config: SegmentationConfig, weights: StrPath | None = None, masks_dir: StrPath | None = None
 ) -> Segmenter:
     """Create the source of instances, which segments each image independently of all others.
 

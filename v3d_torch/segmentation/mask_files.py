@@ -155,10 +155,12 @@ def _read_labels(path: Path) -> dict[int, int]:
         names = parse_yaml(read_text(path, "labels of an id image are a YAML file"))
     except ValueError as error:
         raise InputError(f"{path}: is not valid YAML ({error}); write a line such as 4: chair for each id") from error
-    if not isinstance(names, dict) or not all(isinstance(i, int) and name in COCO_NAMES for i, name in names.items()):
+    if not isinstance(names, dict) or not all(type(i) is int and name in COCO_NAMES for i, name in names.items()):
         raise InputError(
             f"{path}: expected a line such as 4: chair for each id, with classes of COCO; correct the file"
         )
+    if (smallest := min(names, default=1)) < 1:
+        raise InputError(f"{path}: has the id {smallest}, but 0 is the background; number the instances from 1")
     return {i: COCO_NAMES.index(name) for i, name in names.items()}
 
 

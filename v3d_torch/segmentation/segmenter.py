@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
+from v3d_torch.errors import ConfigError, V3DError
+from v3d_torch.io.text import describe_error
+from v3d_torch.runtime.input_checks import describe_type
 from v3d_torch.runtime.stateful import Stateful, has_methods, is_stateful
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
@@ -59,16 +63,31 @@ def innermost_segmenter(segmenter: Segmenter) -> Segmenter:
 
 
 def segmenter_state_of(segmenter: object) -> dict[str, Any] | None:
-    """Return the state of a segmenter; None if it has no state.
+    """Return a copy of the state of a segmenter; None if it has no state.
+
+    It is a copy because frames are segmented ahead of tracking, and a state can share its objects with the segmenter.
 
     A torch module counts as stateless: its state_dict holds its weights, which are constant and too large to copy in
     each frame.
     """
     has_state = is_stateful(segmenter) and not isinstance(segmenter, nn.Module)
-    return cast("Stateful", segmenter).state_dict() if has_state else None
+    return copy.deepcopy(cast("Stateful", segmenter).state_dict()) if has_state else None
 
 
 def restore_segmenter(segmenter: object, state: Mapping[str, Any] | None) -> None:
-    """Restore a state that `segmenter_state_of` returned; do nothing if it is None."""
-    if state is not None and is_stateful(segmenter):
-        cast("Stateful", segmenter).load_state_dict(state)
+    """Restore a state that `segmenter_state_of` returned; do nothing if it is None.
+
+    Raises:
+        ConfigError: If the segmenter cannot load the state, for example because it is that of another segmenter.
+    """
+    if state is None or not is_stateful(segmenter):
+        return
+    try:
+        cast("Stateful", segmenter).load_state_dict(copy.deepcopy(state))
+    except V3DError:
+        raise
+    except Exception as error:  # a segmenter runs any code
+        raise ConfigError(
+            f"the segmenter, {describe_type(segmenter)}, cannot load the saved state ({describe_error(error)}); give"
+            " the segmenter with which the state was saved"
+        ) from error

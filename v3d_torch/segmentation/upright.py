@@ -21,6 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from v3d_torch.runtime.input_checks import check_instances
+from v3d_torch.segmentation.coco import LABELS
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 _PRIOR_WEIGHT = 0.5
@@ -76,6 +78,9 @@ class UprightSegmenter:
 
         Returns:
             Instances of the frame in its own orientation.
+
+        Raises:
+            ConfigError: If the wrapped segmenter did not return valid `Instances`.
         """
         if T_cw is None:
             return self(frame)
@@ -121,11 +126,12 @@ class UprightSegmenter:
 
     def _segment_rotated(self, frame: RGBDFrame, turns: int) -> Instances:
         """Segment a frame after counterclockwise quarter turns; the instances are rotated back."""
-        if turns == 0:
-            return self.wrapped(frame)
-        image, depth = (torch.rot90(values, turns, dims=(1, 2)).contiguous() for values in (frame.image, frame.depth))
-        # Gravity and camera are those of the image before its rotation.
-        instances = self.wrapped(replace(frame, image=image, depth=depth, gravity=None, camera=None))
+        if turns != 0:
+            image, depth = (torch.rot90(each, turns, dims=(1, 2)).contiguous() for each in (frame.image, frame.depth))
+            # Gravity and camera are those of the image before its rotation.
+            frame = replace(frame, image=image, depth=depth, gravity=None, camera=None)
+        instances = self.wrapped(frame)
+        check_instances(instances, frame, LABELS)  # before they are rotated, and before their scores vote
         for _ in range(turns):
             instances = _rotate_clockwise(instances)
         return instances

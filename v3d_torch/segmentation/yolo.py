@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from v3d_torch.config import SegmentationConfig
+from v3d_torch.errors import InputError
 from v3d_torch.features.brightness import brighten
+from v3d_torch.io.paths import StrPath
+from v3d_torch.runtime.input_checks import describe_wrong_tensor
 from v3d_torch.segmentation.decode import decode
 from v3d_torch.segmentation.export import exported_path
 from v3d_torch.segmentation.inference import SplitNetwork, WholeNetwork
@@ -35,8 +39,9 @@ class YOLOSegmenter:
         WeightsError: If the weights are missing, damaged or of another network.
     """
 
-    def __init__(self, config: SegmentationConfig, weights: Path | None = None) -> None:
-        if weights is not None and weights.suffix == ".onnx":
+    def __init__(self, config: SegmentationConfig, weights: StrPath | None = None) -> None:
+        weights = None if weights is None else Path(weights)
+        if weights is not None and weights.suffix.lower() == ".onnx":
             self._network: WholeNetwork | SplitNetwork = WholeNetwork(weights, config.threads)
         else:
             path = exported_path(config.model, find_weights(config.model, weights), config.height, config.width)
@@ -67,8 +72,11 @@ class YOLOSegmenter:
             left <= u < right.
 
         Raises:
+            InputError: If the image is not uint8 RGB of this shape.
             WeightsError: If onnxruntime fails to run the network, or its output contains NaN or infinity.
         """
+        if (wrong := describe_wrong_tensor(image, (3, "H", "W"), torch.uint8)) is not None:
+            raise InputError(f"the image to segment is {wrong}")
         canvas, window = letterbox(brighten(image), self.height, self.width)
         instances = decode(
             self._network(canvas),

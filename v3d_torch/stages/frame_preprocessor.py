@@ -54,7 +54,7 @@ class FramePreprocessor(ReplaceableStages):
         self.config = config = config or Config()
         if segment is not None and segment.__class__ is UprightSegmenter:
             segment = UprightSegmenter(segment.wrapped)  # its votes belong to one system
-        self.segment = segment or make_segmenter(config, camera)
+        self.segment = make_segmenter(config, camera) if segment is None else segment
         self.smooth_depth: DepthStage = DepthSmoother(
             config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio
         )

@@ -19,7 +19,7 @@ from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
-from v3d_torch.runtime.stage_hooks import HookedStage, StageHook
+from v3d_torch.runtime.stage_hooks import HookedStage, StageHook, without_hooks
 from v3d_torch.runtime.stage_import import make_stage
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy, StageProxy
 from v3d_torch.runtime.stateful import Stateful, is_stateful
@@ -134,6 +134,7 @@ class ReplaceableStages:
             raise ConfigError(
                 f"{name} cannot be replaced, because it is used inside {_INNER_STAGES[name]}; replace that instead"
             )
+        value = without_hooks(value)  # those of this system are added below
         if name in STAGES and not callable(value):
             raise ConfigError(f"{name} is {describe_type(value)}, which cannot be called; set a stage")
         if name in _RESULTS and name in vars(self):
