@@ -249,6 +249,16 @@ def test_frames_that_were_not_tracked_are_counted_by_status(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_plots")
+def test_warnings_of_the_run_are_shown(copy: Path) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    assert "Warning" not in page_of(copy).text
+    metrics["warnings"] = ["the depth scale fits badly: use <5000>", "the colours are swapped"]
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    text = page_of(copy).text
+    assert all(f"Warning: {warning}" in text for warning in metrics["warnings"])
+
+
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(
     ("seconds", "expected"),
     [
