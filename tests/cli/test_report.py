@@ -272,6 +272,7 @@ def test_wall_time_is_compared_with_the_sum_of_the_stages(copy: Path, seconds: f
     write_text(copy / "metrics.json", json.dumps(metrics))
     text = " ".join(page_of(copy).text.split())
     assert expected in text and "total, s percentage of wall time" in text
+    assert "wall time of all stages" in text and "0.25 25.0 %" in text  # also if the run took half a second
 
 
 @pytest.mark.usefixtures("without_plots")
