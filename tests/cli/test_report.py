@@ -249,6 +249,16 @@ def test_frames_that_were_not_tracked_are_counted_by_status(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_plots")
+def test_warnings_of_the_run_are_shown(copy: Path) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    assert "Warning" not in page_of(copy).text
+    metrics["warnings"] = ["the depth scale fits badly: use <5000>", "the colours are swapped"]
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    text = page_of(copy).text
+    assert all(f"Warning: {warning}" in text for warning in metrics["warnings"])
+
+
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(
     ("seconds", "expected"),
     [
@@ -262,6 +272,7 @@ def test_wall_time_is_compared_with_the_sum_of_the_stages(copy: Path, seconds: f
     write_text(copy / "metrics.json", json.dumps(metrics))
     text = " ".join(page_of(copy).text.split())
     assert expected in text and "total, s percentage of wall time" in text
+    assert "wall time of all stages" in text and "0.25 25.0 %" in text  # also if the run took half a second
 
 
 @pytest.mark.usefixtures("without_plots")

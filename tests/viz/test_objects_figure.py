@@ -97,6 +97,13 @@ def test_path_has_gap_where_the_object_was_not_seen() -> None:
     assert len(path.get_segments()) == 8  # between ten places, without that from frame 7 to 30
 
 
+def test_camera_path_has_gap_where_there_are_no_frames() -> None:
+    stamps = torch.tensor([0.0, 1, 2, 100, 101], dtype=torch.float64)
+    trajectory = Trajectory(stamps, torch.eye(4, dtype=torch.float64).repeat(5, 1, 1))
+    (axes,) = draw_objects(table_of((1, MotionState.STATIC)), trajectory, torch.rand(5, 3), UP).axes
+    assert torch.tensor(axes.lines[0].get_xdata()).isnan().nonzero()[:, 0].tolist() == [3]
+
+
 def test_only_the_most_important_of_many_objects_have_a_name() -> None:
     """Those that moved, then those with the most frames."""
     table = table_of(*((number, MotionState.STATIC) for number in range(1, 200)), (200, MotionState.DYNAMIC))

@@ -57,6 +57,13 @@ def test_without_floor_only_the_slice_is_drawn(room: tuple[OccupancyMap, Traject
     assert pixels(figure).std() > 10
 
 
+def test_camera_path_has_gap_where_there_are_no_frames(room: tuple[OccupancyMap, Trajectory]) -> None:
+    occupancy, trajectory = room
+    stamps = trajectory.stamps + 100 * (trajectory.stamps >= 10)
+    path = draw_occupancy(occupancy, Trajectory(stamps, trajectory.T_wc), UP, None).axes[0].lines[0]
+    assert np.flatnonzero(np.isnan(path.get_xdata())).tolist() == [10]
+
+
 def test_map_of_a_single_view_and_a_map_without_free_space_are_drawn() -> None:
     occupancy = OccupancyMap(CONFIG)
     eye = torch.eye(4, dtype=torch.float64)

@@ -413,6 +413,12 @@ def test_existing_recording_is_an_error_and_stays(viz: str | None, tmp_path: Pat
     assert file.read_text() == "precious"
 
 
+def test_name_that_the_viewer_does_not_open_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"run\.rec: .*; choose a name that ends in \.rrd"):
+        make_viewer(None, tmp_path / "run.rec", Wall())
+    assert not list(tmp_path.iterdir())
+
+
 def test_incomplete_recording_is_a_failure_after_all_frames(tmp_path: Path) -> None:
     class Full(RerunViewer):
         def _log_map(self, slam: V3DSLAM) -> None:

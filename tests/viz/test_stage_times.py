@@ -19,6 +19,20 @@ def test_times_of_stages_add_up() -> None:
     assert highest == pytest.approx(101, abs=0.5)  # milliseconds, all stages together
 
 
+def test_times_are_interrupted_at_a_gap() -> None:
+    stamps = [*range(300), *range(1000, 1300)]
+    seconds = np.repeat([0.1, 0.2], 300)
+    first, second = draw_stages_over_time(stamps, {"read": seconds}).axes[0].collections[0].get_paths()
+    assert first.vertices.max(axis=0).tolist() == pytest.approx([300, 100])
+    assert second.vertices.max(axis=0).tolist() == pytest.approx([1299.5, 200])
+    assert second.vertices[:, 0].min() == 999
+
+
+def test_time_of_a_single_frame_is_drawn() -> None:
+    (area,) = draw_stages_over_time([5.0], {"read": np.array([0.1])}).axes[0].collections[0].get_paths()
+    assert np.ptp(area.vertices, axis=0).tolist() == [1, 100]
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_one_or_two_frames_are_drawn(frames: int) -> None:
     stamps = arc().stamps[:frames].tolist()

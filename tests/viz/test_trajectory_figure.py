@@ -56,6 +56,13 @@ def test_estimate_is_drawn_aligned(tmp_path: Path) -> None:
     np.testing.assert_allclose(*([float(n) for n in re.findall(r"[\d.]+", d)] for d in (truth, estimate)), atol=1e-3)
 
 
+def test_differences_are_one_path(tmp_path: Path) -> None:
+    """One element per pose makes the report of a long run slow to open."""
+    save_trajectory_figure(arc(), shaken(arc()), tmp_path / "figure.svg")
+    differences, _legend = re.findall(r'<path d="([^"]+)"[^>]*stroke: #d62728', (tmp_path / "figure.svg").read_text())
+    assert differences.count("M") == len(arc())
+
+
 @pytest.mark.parametrize("poses", [0, 1, 2, 60])
 @pytest.mark.parametrize("groundtruth", ["none", "still", "elsewhere"])
 def test_few_poses_and_static_camera_are_drawn(tmp_path: Path, poses: int, groundtruth: str) -> None:

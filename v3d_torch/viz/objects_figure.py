@@ -21,6 +21,7 @@ from v3d_torch.types import Trajectory
 from v3d_torch.viz.fonts import draw_title
 from v3d_torch.viz.label_placement import separate_labels
 from v3d_torch.viz.object_overlay import MOTION_STATE_COLOURS
+from v3d_torch.viz.time_gaps import insert_gaps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,8 +64,8 @@ def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, u
     background = points[:: max(1, len(points) // _MAX_POINTS)].to(torch.float64) @ R_lw.T
     x, y, _ = background.T.numpy()
     axes.scatter(x, y, s=0.3, color="#c8c8c8", linewidths=0, rasterized=True)
-    x, y, _ = (trajectory.T_wc[:, :3, 3] @ R_lw.T).T.numpy()
-    axes.plot(x, y, color="black", linewidth=1.2, label="camera path")
+    path = (trajectory.T_wc[:, :3, 3] @ R_lw.T)[:, :2]
+    axes.plot(*insert_gaps(trajectory.stamps, path).T, color="black", linewidth=1.2, label="camera path")
     rows, omitted = _rows_of_objects(objects)
     named = set(_select_names(objects, rows))
     for number in rows:

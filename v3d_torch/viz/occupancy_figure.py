@@ -17,6 +17,7 @@ from v3d_torch.occupancy.occupancy_grid import OccupancyGrid, occupancy_grid
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.fonts import draw_title
+from v3d_torch.viz.time_gaps import insert_gaps
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -66,7 +67,7 @@ def draw_occupancy(
     _draw_slice(panels[-1], occupancy, T_lw, height, low, high)
     panels[-1].set_title(f"distance to obstacles {place}", fontsize=10)
     for axes in panels:
-        axes.plot(*path[:, :2].T.numpy(), color="tab:blue", linewidth=1.2, label="camera path")
+        axes.plot(*insert_gaps(trajectory.stamps, path[:, :2]).T, color="tab:blue", linewidth=1.2, label="camera path")
         axes.plot(*path[:1, :2].T.numpy(), "o", color="tab:blue", markeredgecolor="white", label="start")
         axes.set_facecolor(STATE_COLOURS[VoxelState.UNKNOWN])
         (left, lower), (right, upper) = low.tolist(), high.tolist()

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from v3d_torch.viz.time_axes import WIDTH, make_time_axes
+from v3d_torch.viz.time_axes import WIDTH, frame_cells, make_time_axes
 
 _MAX_STEPS = 240
 """Maximum number of steps of a plot over time, about one per two pixels of a page. Longer runs are averaged."""
@@ -36,20 +36,21 @@ def draw_stage_bars(seconds_per_frame: Mapping[str, float]) -> Figure:
 
 
 def draw_stages_over_time(stamps: Sequence[float], seconds: Mapping[str, NDArray[np.float64]]) -> Figure:
-    """Draw the time of each frame, stacked by stage.
+    """Draw the time of each frame, stacked by stage; empty at gaps.
 
     Args:
         stamps: Timestamps of the frames, seconds, increasing.
         seconds: Time of each stage in each frame, seconds, shape :math:`(N,)`.
     """
-    times = np.asarray(stamps) - stamps[0]
-    steps = min(len(times), _MAX_STEPS)
-    means = [[part.mean() for part in np.array_split(values, steps)] for values in seconds.values()]
-    figure, (axes,) = make_time_axes(times.tolist(), [1.9], extra_height=0.5)
-    centres = [part.mean() for part in np.array_split(times, steps)]
-    axes.stackplot(
-        centres, 1e3 * np.array(means), labels=list(seconds), colors=_colours(seconds), linewidth=0, step="mid"
-    )
+    times = (np.asarray(stamps) - stamps[0]).tolist()
+    edges, cells = frame_cells(times, np.array(list(seconds.values())))
+    count, gaps = cells.shape[1], np.flatnonzero(np.isnan(cells[0]))
+    regular = np.linspace(0, count, min(count, _MAX_STEPS), endpoint=False, dtype=np.int64)
+    starts = np.unique(np.concatenate([regular, gaps, gaps + 1]))  # no step is an average over a gap
+    means = np.add.reduceat(cells, starts, axis=1) / np.diff(starts, append=count)
+    x = np.repeat(edges[[*starts, count]], 2)[1:-1]  # both ends of each step
+    figure, (axes,) = make_time_axes(times, [1.9], extra_height=0.5)
+    axes.stackplot(x, 1e3 * np.repeat(means, 2, axis=1), labels=list(seconds), colors=_colours(seconds), linewidth=0)
     axes.set(ylabel="time per frame [ms]", ylim=(0, None))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=8, frameon=False, fontsize=8)
     return figure

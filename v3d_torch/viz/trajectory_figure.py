@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from torch import Tensor
+from torch.nn.functional import pad
 
 from v3d_torch.evaluation.association import MAX_TIME_DIFFERENCE, associate_trajectories
 from v3d_torch.evaluation.ate import absolute_errors, align
@@ -100,8 +100,8 @@ def draw_trajectory(
             axes.plot(*insert_gaps(stamps, guesses).T, ":", color="tab:orange", linewidth=1.5, label=label)
         axes.plot(*positions[:1, plane].numpy().T, "o", color=colour, markeredgecolor="white", zorder=3)
     if len(segments):
-        lines = list(segments[:, :, plane].numpy())
-        axes.add_collection(LineCollection(lines, colors="tab:red", linewidths=0.7, alpha=0.7, zorder=1.5))
+        lines = pad(segments[:, :, plane], (0, 0, 0, 1), value=torch.nan).flatten(0, 1)  # one path: small as SVG
+        axes.plot(*lines.T, color="tab:red", linewidth=0.7, alpha=0.7, zorder=1.5)
         axes.plot([], [], color="tab:red", linewidth=0.9, label=f"difference (ATE RMSE {error:.4f} m)")
     axes.plot([], [], "o", color="gray", label="start")
     _set_square_view(axes, torch.cat([positions[:, plane] for _, positions, _, _ in curves]))

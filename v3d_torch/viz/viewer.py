@@ -20,7 +20,7 @@ def make_viewer(viz: str | None, rerun_file: Path | None, sequence: RGBDStream) 
     Raises:
         ConfigError: If the viewer is unknown.
         ViewerError: If the viewer's library is not installed, or the viewer cannot be started.
-        OutputError: If the recording exists or cannot be written.
+        OutputError: If the recording exists, has another suffix or cannot be written.
     """
     if viz not in (None, "rerun"):
         raise ConfigError(f"--viz {viz}: unknown viewer; use --viz rerun")

@@ -39,8 +39,10 @@ def open_stream(*, live: bool, file: Path | None, port: int = PORT) -> rr.Record
 
     Raises:
         ViewerError: If no viewer can be started.
-        OutputError: If the file exists or cannot be written.
+        OutputError: If the file exists, has another suffix or cannot be written.
     """
+    if file is not None and file.suffix != ".rrd":  # the viewer does not open it
+        raise OutputError(f"{file}: cannot be written as a recording of rerun; choose a name that ends in .rrd")
     # The library would replace the file, such as the first part of a run that is resumed with the same options.
     if file is not None and file.is_file():
         raise OutputError(f"{file}: already exists; delete it, or choose another file with --rerun")
