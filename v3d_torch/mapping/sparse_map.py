@@ -195,7 +195,8 @@ class SparseMap(MapTables):
         """Fuse landmarks of a keyframe with landmarks of the map that were matched to the same features.
 
         A feature without a landmark becomes an observation of the matched landmark. If the feature already has
-        another landmark, the two landmarks are merged, unless one keyframe observes both.
+        another landmark, the two landmarks are merged into the older one, unless one keyframe observes both. A landmark
+        that is merged into a culled one is culled, too: it is the same point, which frames did not match well.
 
         Args:
             keyframe: Keyframe whose features were matched.
@@ -206,7 +207,7 @@ class SparseMap(MapTables):
         duplicate = matched & (keyframe.landmarks >= 0)
         self._add_observations(keyframe, torch.nonzero(matched & ~duplicate)[:, 0], landmarks)
         own, other = keyframe.landmarks[duplicate], landmarks[duplicate]
-        landmark_ids.merge_landmarks(self, torch.minimum(own, other), torch.maximum(own, other))  # keep the older one
+        landmark_ids.merge_landmarks(self, torch.minimum(own, other), torch.maximum(own, other))
 
     def remove_observations(self, rows: Tensor) -> None:
         """Remove observations that a bundle adjustment found to be outliers.
