@@ -70,6 +70,8 @@ def test_frame_has_images_camera_pose_and_mask(sequence: RGBDSequence) -> None:
         assert sample["motion_mask"].equal(sequence.motion_mask(index))  # type: ignore[attr-defined]
     with pytest.raises(IndexError):
         dataset[6]
+    with pytest.raises(InputError, match=r"got slice\(0, 2, None\); .* torch\.utils\.data\.Subset$"):
+        dataset[0:2]  # type: ignore[index]
 
 
 @pytest.mark.parametrize("interval", [1, 3, 5])

@@ -138,6 +138,13 @@ def test_time_difference_that_is_not_at_least_zero_is_rejected(difference: float
     assert evaluate(groundtruth, groundtruth, max_time_difference=0).pairs == 10
 
 
+def test_negative_number_of_frames_is_rejected() -> None:
+    """The coverage was negative."""
+    groundtruth = random_walk(10, seed=3)
+    with pytest.raises(ConfigError, match=r"^frames is -3; give the number of frames of the sequence$"):
+        evaluate(groundtruth, groundtruth, frames=-3)
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")])
 def test_timestamps_in_another_unit_are_named(factor: float, unit: str) -> None:
     seconds = random_walk(60, seed=18)

@@ -41,9 +41,10 @@ def test_every_nonzero_value_is_an_instance(tmp_path: Path, dtype: type, values:
         assert np.array_equal(mask.numpy(), ids(dtype, *values) == value)
 
 
-def test_labels_file_gives_the_classes_and_selects_the_ids(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["labels.yaml", "labels.yml"])
+def test_labels_file_gives_the_classes_and_selects_the_ids(tmp_path: Path, name: str) -> None:
     Image.fromarray(ids(np.uint8, 9, 4, 7)).save(tmp_path / "10.000000.png")
-    (tmp_path / "labels.yaml").write_text("7: person\n4: chair\n")
+    (tmp_path / name).write_text("7: person\n4: chair\n")
     instances, read_ids = MaskFolder(tmp_path).read(frame(0, 10.0))
     assert read_ids.tolist() == [4, 7]
     assert [COCO_NAMES[label] for label in instances.labels] == ["chair", "person"]

@@ -96,9 +96,15 @@ class SequenceDataset(Dataset[Sample], ABC):
 
         Raises:
             IndexError: If there is no such sample.
-            InputError: If an image is damaged.
+            InputError: If an image is damaged, or if ``item`` is not an integer.
         """
-        first = self.indices[item]
+        try:
+            first = self.indices[operator.index(item)]
+        except TypeError as error:
+            raise InputError(
+                f"{self.sequence.name}: the index of a sample must be an integer, got {item!r}; select several samples"
+                " with torch.utils.data.Subset"
+            ) from error
         sample = self._combine([self._read(first + offset) for offset in self._offsets])
         return sample if self.transform is None else self.transform(sample)
 

@@ -95,7 +95,8 @@ def evaluate(
     Raises:
         InputError: If fewer than three poses can be associated, if an argument is not a trajectory, if an associated
             pose is not finite, or if ``is_localised`` is not a mask of the poses.
-        ConfigError: If ``max_time_difference`` is negative or not a number, or ``rpe_delta`` is not positive.
+        ConfigError: If ``max_time_difference`` is negative or not a number, if ``rpe_delta`` is not positive, or if
+            ``frames`` is negative.
     """
     for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
         if not isinstance(value, Trajectory):
@@ -110,6 +111,8 @@ def evaluate(
         )
     if not max_time_difference >= 0:  # also for NaN
         raise ConfigError(f"max_time_difference is {max_time_difference}; give a time of at least 0 seconds")
+    if frames is not None and frames < 0:
+        raise ConfigError(f"frames is {frames}; give the number of frames of the sequence")
     matches = associate_trajectories(groundtruth, estimate, max_time_difference)
     if len(matches) < MIN_PAIRS:
         raise InputError(

@@ -36,8 +36,8 @@ class MaskFolder:
     which numbers are compared as numbers: 9.png comes before 10.png. `check_number` checks that there is one for each
     frame.
 
-    A file ``labels.yaml`` in the folder gives the COCO class of each id, a line ``4: chair`` for each; ids that it does
-    not list are no instances. Without this file, all instances are people.
+    A file ``labels.yaml`` (or ``labels.yml``) in the folder gives the COCO class of each id, a line ``4: chair`` for
+    each; ids that it does not list are no instances. Without this file, all instances are people.
 
     Args:
         folder: Folder of the id images.
@@ -53,8 +53,8 @@ class MaskFolder:
             self._paths = [path for path in list_images(folder) if path.suffix.lower() == ".png"]
         if not self._paths:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
-        labels = folder / "labels.yaml"
-        self._labels = _read_labels(labels) if labels.is_file() else None
+        labels = [path for name in ("labels.yaml", "labels.yml") if (path := folder / name).is_file()]
+        self._labels = _read_labels(labels[0]) if labels else None
         stamps = [stamp for path in self._paths if (stamp := stamp_in_name(path)) is not None]
         self._stamps: Tensor | None = None
         if len(stamps) == len(self._paths):
