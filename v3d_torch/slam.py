@@ -1,4 +1,4 @@
-"""V3D-SLAM: the processing of one frame, in the order of the paper."""
+"""V3D-SLAM: the processing of one frame by all stages."""
 
 from __future__ import annotations
 
