@@ -78,9 +78,9 @@ class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     `preprocess` runs the stages that can run ahead of tracking, see `FramePreprocessor`; `track` runs the others. Every
-    stage is an attribute and can be replaced by an object with the same methods; the results of stages that return data
-    are checked. `estimate_motion`, `track_map` and `loop_closer` are used inside other stages and cannot be replaced
-    alone. Hooks see the arguments and results of stages, see `register_stage_hook`.
+    stage is an attribute and can be replaced by an object with the same methods, whose results are checked. Only
+    `estimate_motion`, `track_map` and `loop_closer` cannot be replaced alone, because other stages call them. Hooks get
+    the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.

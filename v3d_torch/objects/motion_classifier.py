@@ -108,8 +108,8 @@ class MotionClassifier:
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
         shifted = self._shifted_tracks(tracks, feature_support, on_objects, view)
         # The camera motion is measured relative to the object with most features, such as a table that fills the image.
-        references = self._rigid_references(tracks, feature_support.have_most_inliers(on_objects))
-        for track in (vote.dynamic | shifted) - references:
+        with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
+        for track in (vote.dynamic | shifted) - with_most_inliers:
             track.mark_dynamic(stamp)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
@@ -142,7 +142,7 @@ class MotionClassifier:
                 chamfer=chamfer.distances.get(track, torch.nan),
                 motion_state=motion_states[track],
                 missed=track.missed,
-                **_place(track, stamp),
+                **_world_attributes(track, stamp),
             )
             for track, mask in zip(tracks, visible, strict=True)
         ]
@@ -166,8 +166,8 @@ class MotionClassifier:
         # A correction replaces the clouds of the tracks; in most frames there is no correction.
         clouds = {id(each.cloud) for each in objects.objects}
         moved = [track for track in self.tracker.tracks if id(track.newest.cloud) not in clouds]
-        places = {track.id: _place(track, self._last_stamp) for track in moved}
-        return replace(objects, objects=[replace(each, **places.get(each.id, {})) for each in objects.objects])
+        corrected = {track.id: _world_attributes(track, self._last_stamp) for track in moved}
+        return replace(objects, objects=[replace(each, **corrected.get(each.id, {})) for each in objects.objects])
 
     def propagate_instances(self, view: DepthView) -> Instances:
         """Propagate the masks of the previous frame to a frame without segmentation; see `mask_propagation`.
@@ -219,7 +219,7 @@ class MotionClassifier:
             track.add_shift(view.stamp, shift, config.time_span)
         return {track for track in tracks if track.last_shifted == view.stamp}
 
-    def _rigid_references(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
+    def _rigid_with_most_inliers(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
         """Return the rigid objects that have most of the inliers; people can have most of them on parts at rest."""
         flags = zip(tracks, have_most_inliers.tolist(), strict=True)
         return {track for track, has_most in flags if has_most and track.is_rigid}
@@ -272,6 +272,6 @@ class MotionClassifier:
         return deforming or motion_state is MotionState.STATIC
 
 
-def _place(track: Track, stamp: float) -> dict[str, Any]:
+def _world_attributes(track: Track, stamp: float) -> dict[str, Any]:
     """Return the attributes of a `TrackedObject` in the world frame."""
     return {"state": track.predict_visible_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}
