@@ -1,4 +1,4 @@
-"""V3D-SLAM: the processing of one frame, in the order of the paper."""
+"""V3D-SLAM: the processing of one frame by all stages."""
 
 from __future__ import annotations
 
@@ -78,9 +78,9 @@ class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     `preprocess` runs the stages that can run ahead of tracking, see `FramePreprocessor`; `track` runs the others. Every
-    stage is an attribute and can be replaced by an object with the same methods; the results of stages that return data
-    are checked. `estimate_motion`, `track_map` and `loop_closer` are used inside other stages and cannot be replaced
-    alone. Hooks see the arguments and results of stages, see `register_stage_hook`.
+    stage is an attribute and can be replaced by an object with the same methods, whose results are checked. Only
+    `estimate_motion`, `track_map` and `loop_closer` cannot be replaced alone, because other stages call them. Hooks get
+    the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -189,9 +189,9 @@ class V3DSLAM(FramePreprocessor):
 
     @property
     def _has_objects(self) -> bool:
-        """False in the baseline without masks, whose object stages would find nothing: they are not called.
+        """True if the object stages are called: not in the baseline without masks, where they would find nothing.
 
-        They are called if any was replaced, or has a hook.
+        Even there they are called if one of them was replaced, or has a hook.
         """
         finds_instances = not isinstance(innermost_segmenter(self.segment), NoSegmentation)
         return self._proposes_objects or finds_instances or self._is_changed(*_OBJECT_STAGES)
@@ -270,7 +270,7 @@ class V3DSLAM(FramePreprocessor):
         if self.occupancy is not None:
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
                 self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate(), T_dc)
-        # The world can have been corrected since the objects were tracked.
+        # The world frame can have been corrected after the objects were tracked.
         objects = self.classify_motion.apply_corrections(objects)
         return FrameResult(**vars(objects), **vars(state), T_dc=T_dc)
 
@@ -379,7 +379,7 @@ class V3DSLAM(FramePreprocessor):
         return {name: require_state(name, each) for name, each in components.items() if each is not None}
 
     def _updated_tensors(self) -> list[Tensor]:
-        """Oldest and newest tensors that are updated in place: if any was made in inference mode, one of these was."""
+        """Oldest and newest tensors that are updated in place; they show whether any was made in inference mode."""
         newest = [keyframe.landmarks for keyframe in self.map.keyframes[-1:]]
         return [self.map.landmarks["point"], *newest, *self._landmarks_outside_of_map()]
 
@@ -398,7 +398,7 @@ class V3DSLAM(FramePreprocessor):
         return orthonormalise(motion.T_cp @ self.poses.T_cw)
 
     def _wait_for_segmentation(self, preprocessed: PreprocessedFrame) -> Segmentation:
-        """Return the segmentation; the network can run beside the stages before."""
+        """Wait for the segmentation, and return it; until then, the network can run in parallel to other stages."""
         segmentation = preprocessed.segmentation
         self._segmenter_state = segmentation.segmenter_state
         self.up_estimator.votes = up_votes(segmentation.segmenter_state)
@@ -408,7 +408,7 @@ class V3DSLAM(FramePreprocessor):
     def _complete_instances(
         self, instances: Instances | None, view: DepthView, newly_occupied: NewlyOccupied
     ) -> Instances:
-        """Redraw the previous objects in a frame without segmentation, and add moving regions without a class."""
+        """Propagate the masks of objects to a frame without segmentation, and add moving regions without a class."""
         if instances is None:
             instances = self.classify_motion.propagate_instances(view)
         if not self._proposes_objects:
@@ -420,24 +420,24 @@ class V3DSLAM(FramePreprocessor):
     ) -> Keyframe | None:
         """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
         part, reference = self.poses.part, self.track_camera.reference_keyframe(pose, self.poses)
-        predicted_T_cw = self._compose_pose(motion)  # includes corrections of the world since the objects were tracked
+        predicted_T_cw = self._compose_pose(motion)  # includes corrections made after the objects were tracked
         keyframe = self.mapper(frame, features, pose, reference)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
         self._apply_world_correction(T_new_old)
-        is_elsewhere = self.poses.part != part
-        if is_elsewhere:  # the pose relative to the stored views is a guess
+        is_other_part = self.poses.part != part
+        if is_other_part:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
             self.classify_motion.static_surfaces.drop_views()
         if pose.status is not TrackingStatus.LOST:
             guessed_T_cw = predicted_T_cw if T_new_old is None else predicted_T_cw @ invert(T_new_old)
-            self.classify_motion.tracker.register(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_elsewhere)
+            self.classify_motion.tracker.register(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_other_part)
         self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)
         return keyframe
 
     def _predict(self) -> PosePrediction | None:
-        """Predict the motion of the camera; None if it was not found in a known map yet."""
+        """Predict the motion of the camera; None until the camera is found in a map of an earlier run."""
         is_new_map = not (self.map.keyframes and self.map.keyframes[0].is_from_earlier_run)
         return self.motion_model.predict(self.poses) if is_new_map or self.poses.was_found else None
 

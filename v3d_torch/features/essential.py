@@ -77,7 +77,7 @@ def essential_ransac(
 
     Returns:
         Matrices with the dtype of ``uv_a``, float32 for integers; their sign is arbitrary. No matrix is found from
-        fewer than 6 pairs, or than 8 if torch computes the hypotheses, or with a singular ``K``, as that of padding.
+        fewer than 6 pairs (8 if torch computes the hypotheses), or if ``K`` is singular, as for padding.
 
     Raises:
         InputError: If ``valid`` is not bool, or a weight is negative, infinite or NaN.

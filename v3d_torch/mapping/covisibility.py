@@ -48,8 +48,8 @@ def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Ten
 def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
     """Find the landmarks that any of the given keyframes observes or observed.
 
-    Observations that a bundle adjustment removed as outliers count, too: their landmarks are in view, and those that
-    others observe can be matched there.
+    Observations that a bundle adjustment removed as outliers count, too: their landmarks are in view, and can be
+    matched if other keyframes still observe them.
 
     Args:
         tables: Data of the map.

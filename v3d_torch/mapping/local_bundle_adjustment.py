@@ -22,12 +22,12 @@ _MAX_ITERATIONS = 5
 """Maximum number of Levenberg-Marquardt steps."""
 
 _COST_TOLERANCE = 1e-5
-"""Relative change of the cost that ends the optimisation. The cost is some thousands of squared standard deviations, so
-a smaller change is a small fraction of one; the adjustment of the next keyframe continues from the result."""
+"""Relative change of the cost that ends the optimisation. The cost, the sum of the squared whitened residuals, is some
+thousands: the change is far below 1. The adjustment of the next keyframe continues from the result."""
 
 _CALIBRATION_KEYFRAMES, _LATE_CALIBRATION_INTERVAL = 20, 10
-"""Number of keyframes at the start that each calibrate the readout, and interval of the keyframes that do so later: by
-then the readout is known well, but the camera can rotate more later."""
+"""Number of keyframes at the start that each calibrate the readout, and interval of later keyframes that do so: the
+readout is then known well, but a later, faster rotation can improve it."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ OPTIONAL_COLUMNS: Columns = {
     "observation/sigma_ratio": torch.ones(2, dtype=torch.float64),
     "view/T_dc": torch.eye(4, dtype=torch.float64),
 }
-"""Columns that are stored only if a row differs from this one, which all rows have in files without the column."""
+"""Default row of each optional column. A column without other rows is not stored, and is completed by this row."""
 
 _MIN_SIGMA_RATIO = torch.finfo(torch.float64).tiny
 """Smallest positive number: standard deviations are not zero."""

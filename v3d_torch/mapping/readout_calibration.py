@@ -26,13 +26,13 @@ _PRIOR_WEIGHT = 0.85
 """Weight of the earlier information: the first bundle adjustments have the least accurate camera motion."""
 
 _INFORMATION_WEIGHT = 0.03
-"""Weight of the information from the curvature. Errors of depth and velocity are correlated between observations, and
-successive bundle adjustments share most of these, so the curvature overestimates the information; 0.03 corresponds to
-standard deviations that are six times larger."""
+"""Weight of the information from the curvature, for standard deviations that are six times larger. The curvature
+overestimates the information, because errors of depth and velocity are correlated between observations, and successive
+bundle adjustments share most observations."""
 
 _MIN_CURVATURE = 1e-6
-"""Smallest curvature of a minimum, as a fraction of the curvature without adjustment of poses and points. Where these
-explain a change of the readout, rounding and the damping of their step leave a smaller one."""
+"""Minimum curvature of a minimum, as a fraction of the curvature without adjustment of poses and points. A smaller
+curvature is due to rounding and damping: poses and points explain every readout."""
 
 
 def estimate_readout(
@@ -55,8 +55,8 @@ def estimate_readout(
     """Improve an estimate of the readout, the time that a camera takes to read the rows of an image.
 
     The adjusted observations were compensated with the earlier estimate. A linear step predicts how poses and
-    landmarks, and the minimum cost, would change with another readout. The minimum of that parabola is combined with
-    the earlier estimate, which is discounted, because successive adjustments share observations.
+    landmarks, and so the minimum cost, would change with the readout. The predicted cost is a parabola. Its minimum is
+    combined with the earlier estimate, which is discounted, because successive adjustments share observations.
 
     Differentiable in all inputs. The method is this project's; cf. Hedborg et al., Rolling Shutter Bundle Adjustment,
     CVPR 2012.

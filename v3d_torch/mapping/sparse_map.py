@@ -153,9 +153,9 @@ class SparseMap(MapTables):
     def update_features(self, keyframe: Keyframe, features: Features, T_cw: Tensor | None = None) -> None:
         """Replace the features of a keyframe by the same features with corrected pixels and depth.
 
-        Landmarks that only this keyframe observes are computed again from its features, if ``T_cw`` is given, or if the
-        keyframe created all landmarks that it observes, so that its pose does not depend on features. Otherwise the
-        next bundle adjustment corrects them together with the pose.
+        The landmarks that only this keyframe observes are computed again from its features in two cases: if ``T_cw`` is
+        given, or if the keyframe created all landmarks that it observes, so that its pose does not depend on features.
+        Otherwise the next bundle adjustment corrects them together with the pose.
 
         Args:
             keyframe: Keyframe of this map.
@@ -195,8 +195,8 @@ class SparseMap(MapTables):
         """Fuse landmarks of a keyframe with landmarks of the map that were matched to the same features.
 
         A feature without a landmark becomes an observation of the matched landmark. If the feature already has
-        another landmark, the two landmarks are merged into the older one, unless one keyframe observes both. A landmark
-        that is merged into a culled one is culled, too: it is the same point, which frames did not match well.
+        another landmark, the two landmarks are merged into the older one, unless one keyframe observes both. If the
+        older one is culled, the merged landmark is culled, too: frames did not match this point well.
 
         Args:
             keyframe: Keyframe whose features were matched.

@@ -33,8 +33,8 @@ _OTHER_DISSIMILARITY = 0.21
 
 _SAMPLING_DISSIMILARITY = 0.6
 """Mean dissimilarity of two histograms of one person in consecutive frames, times the square root of the number of
-points of the smaller visible part: few points show fewer colours, and more of other objects. Measured like the other
-means on people with true masks."""
+points of the smaller visible part: the fewer points, the more of them are on other objects. All means were measured on
+people with true masks."""
 
 _DISSIMILARITY_RATE, _CHANGING_TIME = 0.05, 1.5
 """Increase of this mean per second while a person turns, and the time after which it does not increase further."""

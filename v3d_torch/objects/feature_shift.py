@@ -21,14 +21,14 @@ _MIN_FEATURES = 8
 """Minimum number of matched features whose median is known well enough."""
 
 _GRID = (3, 4)
-"""Rows and columns of the cells of an image whose features are compared with those of an object, which is about as
-large."""
+"""Rows and columns of cells into which an image is divided. The features of an object are compared with those of the
+cells, which are about as large."""
 
 _MIN_CELLS = 3
 """Minimum number of cells with enough features, so that not all of them are on one moving object."""
 
 _QUANTILE = 0.9
-"""Quantile of the displacements of the cells that a moving object exceeds: where the lens model or the depth is wrong,
+"""A moving object is displaced further than this fraction of the cells. Where the lens model or the depth is wrong,
 static places are displaced, too."""
 
 _MIN_SIGMAS = 4.0

@@ -24,8 +24,8 @@ _MIN_SUPPORTING_FEATURES = 10
 """Minimum number of inliers on a supported object: a few inliers can lie on the contour of an object in front of it."""
 
 _MIN_OUTSIDE_FEATURES, _USUAL_INLIER_RATIO = 20, 0.5
-"""With fewer features outside of all objects, their inlier ratio is not known, and this usual ratio is the minimum:
-otherwise a few inliers on a person who fills the image would be enough."""
+"""With fewer features outside of all objects, their inlier ratio is not known. Then at least this usual ratio is
+assumed: otherwise a few inliers on a person who fills the image would be enough."""
 
 
 @dataclass(frozen=True)

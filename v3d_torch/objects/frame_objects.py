@@ -34,11 +34,11 @@ class TrackedObject:
     Attributes:
         id: Number of the object.
         label: COCO class index; see `name` for the class name.
-        mask: Pixels of the object, bool, shape :math:`(H, W)`: the mask of the network, which depth corrects if the
-            object is a person or not static. A predicted mask lacks the surfaces of detected objects of the class. It
-            is empty if these are most of its pixels, or if the object is hidden, not confirmed, or missed for more than
-            0.1 s, because later predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes all
-            predicted pixels.
+        mask: Pixels of the object, bool, shape :math:`(H, W)`: the mask of the network, refined by depth if the object
+            is a person or not static. A predicted mask leaves out the surfaces of detected objects of the class. It is
+            empty if these cover most of it, or if the object is hidden, not confirmed, or missed for more than 0.1 s,
+            because later predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes all predicted
+            pixels.
         state: Position of the visible part and velocity, with their covariance, at the time of the frame.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the time spans; the free-space check has one vote.

@@ -29,8 +29,8 @@ from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE, Instances
 
 _DUPLICATE_COVERAGE = 0.7
-"""An unmatched instance is a second detection of an object if the mask of a matched instance of the class and its own
-have more than this fraction of the smaller one in common: the network finds a part of a person, or all and a part."""
+"""Minimum overlap of an unmatched instance with a matched one of its class from which both are the same object, as a
+fraction of the smaller mask: the network finds a person and also a part of this person."""
 
 _DUPLICATE_DISTANCE = 0.5
 """Maximum distance of the centroids of two detections of an object, metres."""
@@ -39,8 +39,8 @@ _MIN_FREE_FRACTION = 0.5
 """The predicted place of a missed object is empty if the camera sees through more than this fraction of its points."""
 
 _MAX_VISIBLE_TIME = 0.1
-"""A missed object counts as visible for this long, seconds: who is missed for longer mostly is hidden or has turned, so
-that the predicted mask is wrong. Tracking leaves out the pixels of all predicted masks nevertheless."""
+"""A missed object counts as visible for this long, seconds: an object that is missed for longer is mostly hidden or has
+turned, so that its predicted mask is wrong. Tracking still leaves out the pixels of all predicted masks."""
 
 _MAX_VACANT_TIME = 0.5
 """A missed object whose place was observed to be empty for longer has gone elsewhere and is lost, seconds."""
@@ -52,14 +52,15 @@ _MAX_OBSERVED_TIME = 0.2
 class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
-    The instances of a frame continue tracks in five stages, each an optimal assignment. Instances with a class continue
+    The instances of a frame continue tracks in six stages, each an optimal assignment. Instances with a class continue
     confirmed tracks with a class, then resting and lost tracks, then all other tracks. Instances without a class
-    continue tracks without a class, then those with one. An instance that was propagated continues its own track.
+    continue tracks without a class, then those with one, then resting and lost tracks. An instance that was propagated
+    continues its own track.
 
     If an object is not detected any more and may move, its mask is predicted for a short time. An object that does not
-    move has no mask in this time, because tracking uses its pixels; it is called resting. Then both are lost: they keep
-    their ids for some seconds, in case they were hidden or out of view. The state (tracks and next id) is part of
-    ``state_dict()``.
+    move has no mask in this time, because tracking uses its pixels; it is called resting. Afterwards both are lost:
+    confirmed ones keep their ids for some seconds, in case they were hidden or out of view. The state (tracks and next
+    id) is part of ``state_dict()``.
 
     Args:
         config: Gates and times.
@@ -327,8 +328,8 @@ class InstanceTracker(torch.nn.Module):
     def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
         """Check for each track whether its predicted mask shows the surface of a detected track of the same class.
 
-        The mask of the other track alone does not count, because a network sometimes draws one mask over two people;
-        its cloud is that of one of them.
+        The surface of the other track is given by its cloud, which is that of one person; a network sometimes draws one
+        mask over two people.
 
         Args:
             tracks: T tracks.

@@ -23,8 +23,8 @@ and its time constant, seconds: within seconds a person turns, or others walk by
 because masks end at different places."""
 
 _FACTOR_TIME, _FACTOR_PRIOR = 4.0, 5.0
-"""Time constant of the mean that is the variance factor, seconds, because a person walks in the same way for some
-seconds; and weight of its initial value, 1, in measurements, which decays like theirs."""
+"""Time constant of the variance factor, which is a running mean, seconds: a person walks in the same way for some
+seconds. And weight of its initial value 1, in measurements; it decays like the weights of measurements."""
 
 _MIN_FACTOR, _MAX_FACTOR = 0.05, 4.0
 """Range of the variance factor: someone who walks evenly can still turn, and a jump of the mask is no motion."""
@@ -36,15 +36,15 @@ _MIN_SPEED = 1e-9
 class ConstantVelocityKalmanFilter:
     """Constant-velocity Kalman filter of one object, of which a changing part is visible.
 
-    A measured centroid is that of the visible part, which has an offset from that of the whole object. One part of the
-    offset is white noise. The other is a Gauss-Markov process (coloured measurement noise: Bar-Shalom, Li and
+    A measured centroid is that of the visible part, which has an offset from that of the whole object. One component of
+    the offset is white noise. The other is a Gauss-Markov process (coloured measurement noise: Bar-Shalom, Li and
     Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, Sec. 8.4), and belongs to the state of
     the filter: as white noise, it would be confused with motion.
 
-    The filter assumes more noise than most objects have, so that ids hold where masks jump and people turn. For users,
-    the covariances of velocity and acceleration are therefore multiplied by the variance factor that the measurements
-    show: the mean of the normalised squared innovations (same book, Sec. 5.4), which is 1 if the assumed noise is
-    right. The variance of the position is not scaled, because its error is that of the mask.
+    The filter assumes more noise than most objects have, so that ids hold where masks jump and people turn. In the
+    visible state, which users get, a variance factor therefore scales the variances of velocity and acceleration. It is
+    the mean of the normalised squared innovations (same book, Sec. 5.4), which is 1 if the assumed noise is right. The
+    variance of the position is not scaled, because its error is that of the mask.
 
     Args:
         config: Noise and maximum speed.

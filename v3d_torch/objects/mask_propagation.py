@@ -2,10 +2,9 @@
 
 Segmentation of every second frame halves the largest cost of a frame. In the frame between, the track of an object
 predicts its points, and the depth image gives its outline: the pixels near the predicted points that have the depth of
-these points. Objects of propagated masks are measured like objects of network masks, so that centroids, votes and
-Chamfer distances come from the depth of the frame and not from a prediction; only the ids are known before. An object
-without a centroid, for example because it is too far for its depth, has no points to project, or few: it keeps its last
-mask where nothing is measured.
+these points. Propagated masks are then used like network masks: centroids, votes and Chamfer distances come from the
+depth of the frame and not from a prediction; only the ids are known before. An object without a centroid, for example
+because it is too far away, has few or no points to project: it keeps its last mask where nothing is measured.
 """
 
 from __future__ import annotations
@@ -61,8 +60,8 @@ def propagate_instances(
 def predict_mask(track: Track, silhouette: Silhouette, depth: Tensor, max_depth: float, *, stride: int = 1) -> Tensor:
     """Return the pixels near the predicted points that have their depth.
 
-    Without a centroid, the pixels of the last mask at which no points are measured belong to the object as well. The
-    others do not: the depth of what is beside or in front of the object would become its centroid.
+    Without a centroid, the pixels of the last mask at which no points are measured belong to the object as well. Pixels
+    with points do not: the centroid would be that of something beside or in front of the object.
 
     Args:
         track: Track of the object.

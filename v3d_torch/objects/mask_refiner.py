@@ -49,8 +49,8 @@ class RefinedMask(NamedTuple):
     Attributes:
         crop: Rows and columns of the part; none if the mask is empty.
         surface: Pixels of the object there, bool, shape :math:`(h, w)`.
-        mask: These, and other parts of the network's mask: those that were not there before, and those that belonged to
-            the object at its last detection, bool, shape :math:`(h, w)`.
+        mask: The pixels of ``surface``, and other parts of the network's mask: parts that were not there before, and
+            parts that belonged to the object at its last detection, bool, shape :math:`(h, w)`.
     """
 
     crop: Crop
@@ -88,7 +88,7 @@ class MaskRefiner:
         self._static_surfaces = static_surfaces
         self._stride = newly_occupied.stride
         self._step = math.lcm(self._stride, CELL_SIZE)
-        # Distance that a refined mask reaches beyond the mask; surfaces are grown and filled in steps of the stride.
+        # Maximum distance of a refined mask from the network's; surfaces are grown and filled in steps of the stride.
         self._reach = max(self._config.surface_margin, self._config.depth_margin) + 2 * self._stride
         with_centroid = [track for track in tracks if track.newest.has_centroid]
         clouds = predict_clouds(with_centroid, view.stamp, view.T_dw)
@@ -119,7 +119,7 @@ class MaskRefiner:
 
     @cached_property
     def _static_surface(self) -> NDArray[np.bool_]:
-        """Every n-th pixel that a person's mask could reach, and whose surface is a static one of an earlier view."""
+        """Every n-th pixel within reach of a person's mask whose surface an earlier view shows as static."""
         masks = np.zeros(self._concave.shape, np.bool_)
         for track in self._people:
             masks |= track.mask.numpy()[:: self._stride, :: self._stride]
@@ -175,9 +175,9 @@ class MaskRefiner:
     def _with_other_parts(self, track: Track, surface: NDArray[np.bool_], crop: Crop) -> NDArray[np.bool_]:
         """Return an object's pixels and other parts of the network's mask, bool, shape (h, w).
 
-        A network sometimes draws one mask over two people; the second one is not known background. The points of the
-        object lack the body if an arm is far in front of it and larger: what belonged to the object at its last
-        detection is not lost.
+        New parts are kept, because they can be a second person: a network sometimes draws one mask over two people.
+        Parts that belonged to the object at its last detection are kept, because its points can be those of an arm far
+        in front of the body, without the body.
         """
         stride, segmented = self._stride, track.mask.numpy()[crop]
         parts = _wide_parts(segmented[::stride, ::stride] & ~surface[::stride, ::stride], stride)

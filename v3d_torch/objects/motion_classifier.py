@@ -103,13 +103,13 @@ class MotionClassifier:
 
         # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
         vote = hough_vote_evidence(detected, pairs, free_space, self._last_stamp, config.voting)
-        # Independent evidence, not in the paper: features, which show slow motions earlier.
-        # A mask can contain other objects: the arms of people who sit at a table are in the mask of the table.
+        # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
+        # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
         shifted = self._shifted_tracks(tracks, feature_support, on_objects, view)
-        # The camera motion is relative to what has most of the features, such as a table that fills the image.
-        references = self._rigid_references(tracks, feature_support.have_most_inliers(on_objects))
-        for track in (vote.dynamic | shifted) - references:
+        # The camera motion is measured relative to the object with most features, such as a table that fills the image.
+        with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
+        for track in (vote.dynamic | shifted) - with_most_inliers:
             track.mark_dynamic(stamp)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
@@ -142,7 +142,7 @@ class MotionClassifier:
                 chamfer=chamfer.distances.get(track, torch.nan),
                 motion_state=motion_states[track],
                 missed=track.missed,
-                **_place(track, stamp),
+                **_world_attributes(track, stamp),
             )
             for track, mask in zip(tracks, visible, strict=True)
         ]
@@ -163,14 +163,14 @@ class MotionClassifier:
         Args:
             objects: Result of the last call. Objects that the tracker does not have are left as they are.
         """
-        # A correction replaces the clouds of the tracks, and most frames have none.
+        # A correction replaces the clouds of the tracks; in most frames there is no correction.
         clouds = {id(each.cloud) for each in objects.objects}
         moved = [track for track in self.tracker.tracks if id(track.newest.cloud) not in clouds]
-        places = {track.id: _place(track, self._last_stamp) for track in moved}
-        return replace(objects, objects=[replace(each, **places.get(each.id, {})) for each in objects.objects])
+        corrected = {track.id: _world_attributes(track, self._last_stamp) for track in moved}
+        return replace(objects, objects=[replace(each, **corrected.get(each.id, {})) for each in objects.objects])
 
     def propagate_instances(self, view: DepthView) -> Instances:
-        """Redraw the objects of the previous frame in a frame without segmentation; see `mask_propagation`.
+        """Propagate the masks of the previous frame to a frame without segmentation; see `mask_propagation`.
 
         Args:
             view: Depth and pose of the frame.
@@ -211,7 +211,7 @@ class MotionClassifier:
     def _shifted_tracks(
         self, tracks: Sequence[Track], feature_support: FeatureSupport, on_objects: Tensor, view: DepthView
     ) -> set[Track]:
-        """Return the objects whose features, given for each of them, have moved against the camera motion."""
+        """Return the objects whose features (``on_objects``) have moved against the camera motion."""
         config = self._config.feature_shift
         if not config.enabled:
             return set()
@@ -219,8 +219,8 @@ class MotionClassifier:
             track.add_shift(view.stamp, shift, config.time_span)
         return {track for track in tracks if track.last_shifted == view.stamp}
 
-    def _rigid_references(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
-        """Return the rigid objects that have most of the inliers: people move some of their parts, and not others."""
+    def _rigid_with_most_inliers(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
+        """Return the rigid objects that have most of the inliers; people can have most of them on parts at rest."""
         flags = zip(tracks, have_most_inliers.tolist(), strict=True)
         return {track for track, has_most in flags if has_most and track.is_rigid}
 
@@ -233,7 +233,7 @@ class MotionClassifier:
             stamp: Timestamp of the frame, seconds.
         """
         config = self._config.static_mask
-        # While it is masked, its features are not matched, and free space does not show slow motions.
+        # A shift counts for a while: features of a masked object are not matched, and free space shows no slow motions.
         has_shifted = stamp - track.last_shifted <= config.hold_dynamic_time
         if track.last_dynamic == stamp or has_shifted:
             return MotionState.DYNAMIC
@@ -242,7 +242,7 @@ class MotionClassifier:
         rarely_detected = track.total_score < _MIN_MISSED_SCORE and track.last_dynamic == -torch.inf
         if track.missed and (at_rest_over_all or rarely_detected):
             return MotionState.STATIC
-        # Gaits pause, but a rigid thing that is at rest over all known time spans has stopped.
+        # A walking person pauses, but a rigid thing that is at rest over all known time spans has stopped.
         known = [rest for rest, fraction in zip(at_rest, appeared, strict=True) if not isnan(fraction)]
         if track.label in RIGID and known and all(known):
             return MotionState.STATIC
@@ -272,6 +272,6 @@ class MotionClassifier:
         return deforming or motion_state is MotionState.STATIC
 
 
-def _place(track: Track, stamp: float) -> dict[str, Any]:
+def _world_attributes(track: Track, stamp: float) -> dict[str, Any]:
     """Return the attributes of a `TrackedObject` in the world frame."""
     return {"state": track.predict_visible_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}

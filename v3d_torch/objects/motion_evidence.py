@@ -103,8 +103,8 @@ def free_space_evidence(
         config: Tolerances.
         camera: Camera of the frame.
     """
-    # The known pixels of furniture beside a moving person can be those of the person only, because network masks are
-    # coarse. What cannot move by itself has moved only if most of it is known to have appeared.
+    # Network masks are coarse: all known pixels of furniture beside a moving person can be those of the person.
+    # Therefore furniture has moved only if most of all its pixels have appeared.
     of_all = [track.label in RIGID for track in tracks]
     # A far unlabelled region is smaller than other objects, but each of its pixels was new when it was proposed.
     least = min(config.min_points, MIN_REGION_SIDE**2)

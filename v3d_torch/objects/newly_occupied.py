@@ -45,8 +45,7 @@ class NewlyOccupied:
         Args:
             masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
             min_pixels: Minimum number of known pixels of each object.
-            of_all: True for the objects whose fraction is that of all pixels, false for those whose fraction is that of
-                the known pixels; K elements.
+            of_all: True for a fraction of all pixels of the object, false for a fraction of the known ones; K elements.
 
         Returns:
             Fraction for each object and time span, NaN if too few pixels are known; float64, shape :math:`(K, B)`.

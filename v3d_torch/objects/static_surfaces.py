@@ -1,7 +1,8 @@
-"""Static surfaces in the views of the last seconds, for the places that people hide now and then.
+"""Static surfaces in the views of the last seconds, for places that people occlude for a short time.
 
-The free-space check compares a frame with two earlier ones. What a person hid in both is unknown: the floor before the
-feet of a person who walks towards the camera seems as new as the person. Views of the seconds before often show it.
+The free-space check compares a frame with one earlier frame for each time span. A place that a person occluded in all
+of them is unknown: the floor before the feet of a person who walks towards the camera seems as new as the person.
+Views of the last seconds often show this place.
 """
 
 from __future__ import annotations
@@ -83,6 +84,6 @@ class StaticSurfaces(StoredViews):
         is_early = bool(self._views) and view.stamp < self._views[-1].stamp + _INTERVAL - STAMP_TOLERANCE
         if is_early or not self._config.enabled:
             return
-        # Without the people's depth first: the minimum around a pixel beside a person would be the person's.
+        # Remove the depth of people first: otherwise the minimum around a pixel beside a person is that of the person.
         nearest_depth = replace(view, depth=view.depth * static).nearest_depth
         self._store(StoredView(view.stamp, nearest_depth, T_dw), _TIME_SPAN)

@@ -20,8 +20,8 @@ from v3d_torch.segmentation.coco import LIVING, RIGID, UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE
 
 _WHOLE_SIGMA = 0.05
-"""Standard deviation of the centroid of a fully visible object from that of the object, metres: arms and legs swing by
-more, and the camera sees one side."""
+"""Standard deviation between the measured centroid of a fully visible object and its true one, metres: arms and legs
+swing by more, and the camera sees one side."""
 
 _PARTIAL_SIGMA = 0.45
 """Additional standard deviation of the centroid if nearly nothing of the object is visible, metres, in proportion to
@@ -94,8 +94,8 @@ class Track:
 
     Attributes:
         id: Number of the object, from 1, never reused.
-        first_stamp: Timestamp of the first detection since the object was last lost, or not observed for longer than
-            detections are kept, seconds.
+        first_stamp: Timestamp of the first detection, seconds. It starts again after the object was lost, and after a
+            gap that is longer than detections are kept.
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
@@ -110,12 +110,12 @@ class Track:
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
         appearance_points: Mean number of points of the views in this histogram, with the same weights.
         vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
-        vacancy: Evidence of this, see `vacancy_log_ratio`.
+        vacancy: Evidence of the empty place, see `vacancy_log_ratio`.
         dynamic_frames: Number of frames in which free space, votes or features showed a motion of the object.
         last_dynamic: Timestamp of the last of these frames, seconds.
         last_deforming: Timestamp of the last frame in which the object deformed, see `chamfer_evidence`, seconds.
-        supported_since: Timestamp of the first frame since which its features have fitted the camera motion in every
-            frame, seconds; infinity if they did not in the newest frame.
+        supported_since: Timestamp of the first of the consecutive frames, up to the newest, in which its features fit
+            the camera motion, seconds; infinity if they do not fit in the newest frame.
         last_shifted: Timestamp of the last frame in which its features had moved against the camera motion, seconds.
         history: States of the visible part after detections of the last 10 s, oldest first.
     """
@@ -262,7 +262,7 @@ class Track:
             detection: Detection, not older than the newest one.
         """
         oldest = detection.stamp - _DETECTION_TIME - STAMP_TOLERANCE
-        if self.detections and self.newest.stamp < oldest:  # it may have moved unobserved, and counts as new
+        if self.detections and self.newest.stamp < oldest:  # the object may have moved unobserved, and counts as new
             self.first_stamp = detection.stamp
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
@@ -387,7 +387,7 @@ class Track:
         self.detections = [d.transform(T_new_old) if d.stamp >= since else d for d in self.detections]
         if since == -torch.inf:
             self._filter.apply_world_correction(T_new_old)
-        elif self._filter.state.stamp >= since:  # it has mixed both world frames
+        elif self._filter.state.stamp >= since:  # the state combines measurements in both world frames
             self._filter = ConstantVelocityKalmanFilter(self._config)
             for detection in self.detections:
                 if detection.stamp >= since:

@@ -192,8 +192,8 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
 def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Add up the evidence for each pair of a track without a predicted mask and an instance.
 
-    The last view of an object that left was small, and says little about what is visible when it returns: the views of
-    the mean appearance count.
+    The size of a track's view, for the evidence of appearance, is the mean over its views: the last view of an object
+    that left the image is small.
 
     Args:
         tracks: T tracks.

@@ -19,10 +19,10 @@ _MIN_OWN_FRACTION = 0.5
 def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask], missing: Tensor) -> list[Tensor]:
     """Return the visible pixels of each object, bool, shape :math:`(H, W)`.
 
-    They are those of the refined mask, if there is one, without the pixels that its margin adds where depth is missing
-    or where the network detected another object of the class. A predicted mask lacks the surfaces of detected objects
-    of its class. It is empty if these are most of it: the object is behind another one. Otherwise the detected objects
-    lack its pixels: the network sometimes draws one mask over two.
+    An object has its refined mask, if there is one, without the pixels that the margin adds where depth is missing or
+    where the network detected another object of the class. From a predicted mask, the surfaces of detected
+    objects of the class are removed. If they cover most of it, the object is behind another one, and its mask is empty.
+    Otherwise its pixels are removed from the detected objects: the network sometimes draws one mask over two objects.
 
     Args:
         tracks: Tracks of the frame, detected or missed.
@@ -74,7 +74,7 @@ def _corrected(
 
 
 def _surface(track: Track, refined: RefinedMask | None) -> NDArray[np.bool_]:
-    """Return the pixels of an object without those of others in its mask, shape (H, W)."""
+    """Return the pixels of an object without the other parts of its refined mask, shape (H, W)."""
     own: NDArray[np.bool_] = track.mask.numpy()
     if refined is None:
         return own

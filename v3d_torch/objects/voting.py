@@ -125,8 +125,8 @@ def vote_with_free_space(
     may_vote = ~moved & ((current - previous).norm(dim=1) < _STATIC_VOTER_RATIO * config.distance_threshold)
     pair = pair * may_vote
     votes = pair.sum(dim=1) + moved
-    # Voters on a moved object are all objects that may vote, as moved ones may not, and the free-space check. If there
-    # are fewer of them than the vote threshold, all of them must vote for the object.
+    # The voters on a moved object are the objects that may vote, and the free-space check. If there are fewer voters
+    # than the vote threshold, all of them must vote for the object.
     voters = may_vote.sum() + 1
     return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), pair
 

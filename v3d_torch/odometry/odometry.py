@@ -47,7 +47,7 @@ class CameraMotion:
             static points in the camera frame. `CameraState.twist`, that of the camera, has the opposite sign.
         pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape
             :math:`(K, 2)`; K = 0 for a motion found by dense alignment, and for a prediction.
-        is_measured: True if the frames were registered, False if the motion is only predicted.
+        is_measured: True if the motion was estimated from both frames, False if it is only predicted.
         matches: All matches by descriptors, inliers and outliers, in the same form as ``pairs``, shape :math:`(M, 2)`.
     """
 

@@ -69,10 +69,10 @@ class Readout:
         return cls(config.readout, config.readout_sigma**-2)
 
     def for_new_run(self, initial: Readout) -> Readout:
-        """Return the readout with which a new run starts on the map of the run that estimated this one.
+        """Return the initial readout of a run that loads a map, given this readout of the map.
 
         Args:
-            initial: Readout of the new run without a map.
+            initial: Readout with which the run would start without a map.
         """
         if initial.is_certain:
             return initial

@@ -40,9 +40,8 @@ _SNAPSHOTS = 6
 """Number of frames in the figure of masks."""
 
 _CHECKED_KEYFRAMES = 15
-"""Number of keyframes after which camera and depth are checked: some seconds of a moving camera. A shorter run is
-checked at its end, and so is a live run, because a check takes a second, or some seconds if it finds an error. It is
-not repeated."""
+"""Number of keyframes after which camera and depth are checked once: some seconds of a moving camera. Shorter runs and
+live runs are checked at their end; a check takes a second, or some seconds if it finds an error."""
 
 FrameCallback = Callable[[RGBDFrame, FrameResult], None]
 
@@ -145,7 +144,10 @@ class Pipeline:
 
     @torch.inference_mode()
     def flush(self) -> None:
-        """Apply the pending results of the back end and check the camera, after the last frame: all poses are final."""
+        """Apply the pending results of the back end, so that all poses are final, and check camera and images.
+
+        Call this after the last frame.
+        """
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
@@ -166,7 +168,7 @@ class Pipeline:
 
     @torch.inference_mode()
     def fuse_points(self) -> PointMap:
-        """Fuse the point map, which takes long, and much memory, and show the final state, after `flush`.
+        """Fuse the point map, which takes much time and memory, and show the final state; call `flush` before.
 
         Returns:
             Point map of the static scene, fused from the views whose place in the map is known.
@@ -240,7 +242,7 @@ class Pipeline:
         self.record.repeated_depth.add(frame.depth)
         self.record.states.append_state(result)
         self.record.dynamics.append_objects(frame, result, self.slam.up)
-        with self._stopwatch.paused():  # no part of the system, whose rate is measured
+        with self._stopwatch.paused():  # the frame rate is that of the system, without the evaluation
             self._evaluate_masks(frame, result)
         for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
             if folder is not None:
@@ -264,7 +266,7 @@ class Pipeline:
         self.record.was_checked = True
 
     def _keep_snapshot(self, snapshot: Snapshot) -> None:
-        """Keep the most dynamic frame, and frames at equal intervals, which increase during a live stream.
+        """Keep the frame with the most dynamic votes, and frames at equal intervals, which increase in a live stream.
 
         Intervals are numbers of tracked frames, because a live stream drops frames irregularly.
         """

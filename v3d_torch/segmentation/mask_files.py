@@ -24,8 +24,8 @@ _MAX_GAP = 0.02
 """Maximum time between an id image and its frame, seconds: the tolerance of the TUM tools between colour and depth."""
 
 _MAX_INSTANCES = 255
-"""Maximum number of instances in an image. A depth image that is read as an id image has thousands of values, each of
-which would become a mask of full size."""
+"""Maximum number of instances in an image. A depth image given by mistake has thousands of values, each of which would
+become a mask of full size."""
 
 
 class MaskFolder:

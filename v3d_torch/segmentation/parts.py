@@ -75,7 +75,7 @@ def split(path: Path, targets: PartPaths) -> None:
 
 
 def _extract(model: onnx.ModelProto, inputs: Sequence[str], outputs: Sequence[str]) -> onnx.ModelProto:
-    """Part of a network between given tensors; inputs on which the outputs do not depend are left out."""
+    """Part of a network between given tensors; inputs that do not affect the outputs are left out."""
     from onnx import TensorProto, helper
 
     producers = {name: node for node in model.graph.node for name in node.output}

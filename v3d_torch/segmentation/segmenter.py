@@ -56,7 +56,7 @@ def without_empty_masks(instances: Instances) -> Instances:
 
 
 def innermost_segmenter(segmenter: Segmenter) -> Segmenter:
-    """Return the source of the instances: the segmenter inside of wrappers, which have it as attribute ``wrapped``."""
+    """Return the segmenter inside all wrappers; the attribute ``wrapped`` of a wrapper is the segmenter inside it."""
     while (wrapped := getattr(segmenter, "wrapped", None)) is not None:
         segmenter = wrapped
     return segmenter

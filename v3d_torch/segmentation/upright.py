@@ -6,9 +6,9 @@ upright one gives the detections with the highest scores. In a search, each turn
 frame. As the camera turns, correct votes add up and wrong votes cancel out. A few searches suffice, because the camera
 poses relate the up direction to each new frame.
 
-The first image is segmented in all turns. Each search then takes three images, and segments each of them upright and in
-one other turn, so that a live camera does not wait for four images at once. The first search is that of the next three
-images.
+The first image is segmented in all turns. Each later search takes three images, and segments each of them upright and
+in one other turn, so that a live camera never waits for four turns of one image. The next three images are such a
+search.
 """
 
 from __future__ import annotations

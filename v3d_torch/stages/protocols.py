@@ -78,7 +78,8 @@ class OdometryStage(Protocol):
         Args:
             previous: Previous frame, whose static pixels are known; None for the first frame.
             current: Current frame.
-            T_cp: Predicted pose of the previous camera in the current one, float64, shape :math:`(4, 4)`.
+            T_cp: Predicted motion, maps points from the previous camera to the current one, float64, shape
+                :math:`(4, 4)`.
             velocity: Predicted velocity, see `CameraMotion`, float64, shape :math:`(6,)`.
         """
 

@@ -108,7 +108,7 @@ _INNER_STAGES = {
     "track_map": "track_camera",
     "loop_closer": "track_camera and back_end",
 }
-"""Stages to which other stages hold a reference, and the names of these stages."""
+"""Stages that other stages call, and the names of these other stages."""
 
 STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end")))
 """Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
@@ -148,10 +148,10 @@ class ReplaceableStages:
         A hook does not change results: what it returns is ignored, and it must not change tensors in place. Arguments
         and results are not copied; copy what a later stage could change. An error in a hook ends the call of the stage.
 
-        `segment` is called in the thread "segmentation", `smooth_depth` and `detect_features` in the thread "features",
-        if frames are preprocessed ahead, which is the default in `v3d_torch.pipeline.Pipeline` and `LiveSLAM`: these
-        calls are some frames ahead of those of the other stages, which are called in the thread that calls `track`.
-        Within a thread, calls are in the order of the frames.
+        If frames are preprocessed ahead, which is the default in `v3d_torch.pipeline.Pipeline` and `LiveSLAM`, the
+        thread "segmentation" calls `segment`, and the thread "features" calls `smooth_depth` and `detect_features`.
+        These calls are some frames ahead of those of the other stages, in the thread that calls `track`. Within a
+        thread, calls are in the order of the frames.
 
         Args:
             name: Name of a stage, such as ``odometry``; None for all stages.

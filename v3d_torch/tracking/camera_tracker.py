@@ -87,9 +87,9 @@ class CameraTracker:
     def reference_keyframe(self, pose: FramePose, poses: PoseHistory) -> Keyframe | None:
         """Return the keyframe that shares most landmarks with a frame; None if there is no keyframe.
 
-        A frame without landmarks continues the motion of the previous frame, so that it has the reference keyframe of
-        that frame: the last keyframe can belong to another part of the map. Without a previous frame in the map it is
-        the last keyframe.
+        The pose of a frame without landmarks continues that of the previous frame. Therefore it has the same reference
+        keyframe; the newest keyframe can belong to another part of the map. If the previous frame has none, the newest
+        keyframe is returned.
 
         Args:
             pose: Pose of the frame.

@@ -33,10 +33,10 @@ class PoseHistory:
             T_ck=((4, 4), torch.float64),  # motion from the keyframe to the camera
             is_motion_measured=((), torch.bool),  # true if the motion since the previous frame was measured
         )
-        self._keyframes: dict[int, Keyframe] = {}  # to which poses are relative, by index
+        self._keyframes: dict[int, Keyframe] = {}  # those to which poses are relative, by index
         self.last_found = -torch.inf
         self.observed_landmarks = torch.zeros(0, dtype=torch.int64)
-        self._place: Keyframe | None = None  # to which the last frame that observed landmarks is relative
+        self._place: Keyframe | None = None  # keyframe of the last frame that observed landmarks
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -96,8 +96,8 @@ class PoseHistory:
     ) -> Tensor | None:
         """Append the pose of a frame.
 
-        When the camera is found again, or starts a part of the map, the lost frames before it get poses from the
-        measured motions. When it is found for the first time, all earlier frames are moved, because their world frame
+        When the camera is found again, or starts a part of the map, the lost frames before get poses from the measured
+        motions. When the camera is found for the first time, all earlier frames are moved, because their world frame
         was a guess.
 
         Args:

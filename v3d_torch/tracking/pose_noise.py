@@ -2,9 +2,9 @@
 
 The information matrix of a pose assumes that the errors of its features are independent. They are not: motion blur, the
 rolling shutter and errors of depth shift many features together. Residuals do not show such shifts, because the pose
-follows them, but the sequence of poses does, because a camera moves smoothly and errors do not. The difference between
-a pose and the cubic interpolation of the two poses before and the two after it is noise, or motion that changes within
-a few frames, which also counts as noise (difference-based variance estimation; Hall, Kay and Titterington, Biometrika
+follows them, but the sequence of poses does, because a camera moves smoothly and errors do not. Each pose is compared
+with the cubic interpolation of the two poses before and the two after it. The difference counts as noise, also where
+the motion changes within a few frames (difference-based variance estimation; Hall, Kay and Titterington, Biometrika
 1990).
 """
 

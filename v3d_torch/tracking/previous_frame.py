@@ -17,10 +17,10 @@ from v3d_torch.tracking.pose_history import PoseHistory
 class PreviousFrameRefinement:
     """Compensates the features of the previous frame again with a better velocity, and refines its pose.
 
-    If the previous frame is the newest keyframe, its features in the map are updated, and bundle adjustment refines its
-    pose. If the motion to the keyframe was not measured, as in the first frame after a gap, it was tracked without a
-    velocity. Its pose is then refined here, and its new landmarks move with it, before other frames are tracked with
-    them.
+    If the previous frame is the newest keyframe, its features in the map are updated, and the next bundle adjustment
+    refines its pose. But if the motion to the keyframe was not measured, as after a gap, the keyframe was tracked
+    without a velocity. Then its pose is refined here, and its new landmarks move with it, before the next frame is
+    tracked with them.
 
     Args:
         track_map: Refines a pose.

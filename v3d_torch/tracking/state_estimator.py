@@ -35,8 +35,8 @@ _FIRST_FRAME_NOISE = _covariance(0.01, 0.01)
 """Noise of frames before any frame is tracked in the map: that of a frame-to-frame motion with a scene at 1 to 2 m."""
 
 _LOST_FOR_A_SECOND = _covariance(1.0, 1.0)
-"""Additional covariance of a camera that is not found for a second although its motion is measured, as after a jump to
-another place: it can be wherever it could move at walking speed."""
+"""Additional covariance of a camera that is lost for a second although its motion is measured, as after a jump: it can
+be wherever it could move at walking speed."""
 
 
 class StateEstimator:
@@ -44,8 +44,8 @@ class StateEstimator:
 
     The covariance of a pose that was tracked in the map is the sum of the noise of the frame (`PoseNoise`) and of the
     map (`MapNoise`). If only the motion since the previous frame was measured, the noise of a frame is added to the
-    previous covariance. Without a measured motion, the covariance grows with the uncertainty of the twist
-    (`PoseKalmanFilter`). It also grows while a lost camera is not found where its measured motion leads.
+    previous covariance; a lost camera adds `_LOST_FOR_A_SECOND`, because it may have jumped. Without a measured motion,
+    the covariance grows with the uncertainty of the twist (`PoseKalmanFilter`).
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class StateEstimator:
         self._frame_noise = _FIRST_FRAME_NOISE  # of the last pose that was tracked in the map
         self._owners = torch.zeros(0, dtype=torch.int64)  # keyframes that created its landmarks
         self._covariance = _UNKNOWN  # of the last pose
-        self._known_covariance = _UNKNOWN  # the same without growth since the motion was last measured
+        self._known_covariance = _UNKNOWN  # the same without the growth since the last measured motion
         self._last_measured = self._last_found = -torch.inf
         self._part_covariance_w = torch.zeros(6, 6, dtype=torch.float64)  # of the newest disconnected part
 

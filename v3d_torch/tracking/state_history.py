@@ -24,7 +24,7 @@ _MAX_PREDICTION = 86_400.0
 
 
 class _History(NamedTuple):
-    """States of the last frames, and time and measured motion of the next frame if it is not among them yet."""
+    """States of the last frames, and time and measured motion of the next frame while its state is not known yet."""
 
     states: tuple[CameraState, ...] = ()
     next_motion: tuple[float, CameraMotion] | None = None
@@ -37,9 +37,9 @@ class StateHistory:
         self._history = _History()  # replaced and never changed, so that threads can read it
 
     def append(self, state: CameraState) -> None:
-        """Append the state at a frame, and remove those before the last state that is at least 10 s older.
+        """Append the state at a frame, and remove states that are older than 10 s.
 
-        The last one is kept, because the pose 10 s ago is interpolated between it and the next.
+        The newest of these is kept, because the pose 10 s ago is interpolated between it and the next one.
         """
         states = self._history.states
         first = max(bisect_right(states, state.stamp - _DURATION, key=_stamp) - 1, 0)
@@ -47,10 +47,10 @@ class StateHistory:
         self._history = _History((*states[first:end], state))
 
     def append_motion(self, stamp: float, motion: CameraMotion) -> None:
-        """Append a motion that is known before the state at its frame: until `append`, it moves the last state.
+        """Append the motion to a new frame whose state is not known yet: until `append`, it moves the last state.
 
-        The covariance at the frame is then that of the prediction of the last state, which is larger. A motion that was
-        not measured adds nothing to the prediction.
+        The covariance at the new frame is that of a prediction, and so larger than the actual one. A motion that was
+        not measured is ignored, because it is a prediction itself.
 
         Args:
             stamp: Time of the new frame, seconds.
