@@ -287,6 +287,9 @@ def test_map_is_turned_at_the_end_if_up_is_known_only_then(lost_at: int, tmp_pat
     assert ("camera_link" in {each.child_frame_id for each in after.transforms}) == (lost_at == FRAMES)
     points, _ = points_of(messages["/cloud_map"][0][1])
     np.testing.assert_array_equal(points, points_in_map(fused.points, T_mw))
+    # A player that has reached the last message applies the transforms up to its time.
+    for topic, header in (("/tf", after.transforms[0].header), ("/path", path.header)):
+        assert messages[topic][-1][0] == header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
 def test_lost_camera_has_camera_info_only_and_removes_the_markers_once(tmp_path: Path) -> None:

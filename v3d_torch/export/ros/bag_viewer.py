@@ -47,7 +47,7 @@ class BagViewer:
     ) -> None:
         """Write the messages of a frame. The time this takes is recorded as the stage ``viewer``."""
         with slam.timer("viewer"):
-            self._write(self._messages.of_frame(frame, objects, slam), frame.stamp)
+            self._write(self._messages.of_frame(frame, objects, slam))
 
     def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
         """Write the final path and map, if the camera was ever found, and close the file.
@@ -56,7 +56,7 @@ class BagViewer:
             OutputError: If the bag could not be written completely.
         """
         if self._bag is not None:
-            self._write(self._messages.of_end(slam, point_map), slam.poses.stamp)
+            self._write(self._messages.of_end(slam, point_map))
             try:
                 self._bag.close()
             except OutputError as error:
@@ -64,13 +64,13 @@ class BagViewer:
         if self._error is not None:
             raise self._error
 
-    def _write(self, messages: Iterable[TopicMessage], stamp: float) -> None:
+    def _write(self, messages: Iterable[TopicMessage]) -> None:
+        """Write messages at the times of their headers: players do not apply transforms that are later."""
         if self._error is not None:
             return
         try:
             self._bag = self._bag or BagFile(self._path)
-            time = nanoseconds(stamp)
             for topic, message in messages:
-                self._bag.write(topic, message, time)
+                self._bag.write(topic, message, nanoseconds(self._messages.stamp))
         except OutputError as error:
             self._error = error

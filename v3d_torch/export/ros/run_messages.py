@@ -20,6 +20,7 @@ more ``/tf``; a measured gravity is known at the first frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import ClassVar, Protocol
 
@@ -60,9 +61,13 @@ class RunMessages:
 
     Args:
         camera: Camera of all frames.
+
+    Attributes:
+        stamp: Timestamp of the newest message, seconds; NaN before the first one.
     """
 
     def __init__(self, camera: PinholeCamera) -> None:
+        self.stamp = math.nan
         self._camera = camera
         self._odometry_frame = frames.OdometryFrame()
         self._previous: int | None = None  # position in the pose history
@@ -80,7 +85,7 @@ class RunMessages:
         Raises:
             OutputError: If the timestamp is out of the range of ROS messages.
         """
-        stamp = frame.stamp
+        self.stamp = stamp = frame.stamp
         yield "/camera/color/camera_info", camera_info(stamp, frames.OPTICAL, self._camera)
         if slam.poses.status is TrackingStatus.LOST:
             if self._has_markers:  # viewers would show them until the camera is found
@@ -108,17 +113,20 @@ class RunMessages:
         """
         if not slam.poses.was_found:
             return
-        stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), frames.map_frame(slam.T_lw)
+        self.stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), frames.map_frame(slam.T_lw)
         if not torch.equal(T_mw, self._T_mw):
-            stamp, self._T_mw = stamp + _TURN_DELAY, T_mw
+            self.stamp, self._T_mw = self.stamp + _TURN_DELAY, T_mw
             newest = len(slam.poses) - 1 if self._previous is None else self._previous
             T_ml = frames.camera_in_map(invert(slam.poses.poses_of([newest])[0]), T_mw)
             self._odometry_frame.update(T_ml, T_ml)
-            yield "/tf", self._tree(stamp, is_lost=slam.poses.status is TrackingStatus.LOST)
-        yield "/path", path(stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw))
+            yield "/tf", self._tree(self.stamp, is_lost=slam.poses.status is TrackingStatus.LOST)
+        yield (
+            "/path",
+            path(self.stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw)),
+        )
         points = frames.points_in_map(point_map.points, T_mw)
-        yield "/cloud_map", point_cloud(stamp, frames.MAP, points, point_map.colours)
-        yield from self._grid(stamp, slam)
+        yield "/cloud_map", point_cloud(self.stamp, frames.MAP, points, point_map.colours)
+        yield from self._grid(self.stamp, slam)
 
     def of_grid(self, slam: V3DSLAM) -> Iterator[TopicMessage]:
         """Yield the occupancy grid, if there is one; finding its floor takes up to a tenth of a second.
