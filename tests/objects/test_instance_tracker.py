@@ -121,6 +121,18 @@ def test_hidden_object_gets_its_id_back_with_or_without_a_class(label: int) -> N
     assert [track.id for track in tracks] == [1]
 
 
+def test_lost_object_gets_its_id_back_at_its_place_although_another_one_is_missed_nearby() -> None:
+    """One is hidden for 0.7 s, the other one for 0.3 s; then the first one is where it was."""
+    track_boards, left, right = BoardTracker(), Board(-0.25), Board(0.25)
+    curtain = Board(0.0, z=1.5, width=2.0, height=2.0, detected=False)
+    covered = Board(-1.0, z=1.5, width=1.5, height=2.0, detected=False)
+    for frame in range(28):
+        boards = [left, right] if frame < 6 else [covered, right] if frame < 18 else [curtain] if frame < 27 else [left]
+        depth, instances = render(boards)
+        tracks = track_boards.track(depth, instances, frame / 30)
+    assert at(tracks, left).id == 1
+
+
 @pytest.mark.parametrize("compared", [True, False])
 def test_colours_decide_between_two_people_who_return(compared: bool) -> None:
     """A curtain hides both for a second; then each one is at the place of the other one."""

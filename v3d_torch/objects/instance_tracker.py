@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import torch
@@ -52,10 +52,9 @@ _MAX_OBSERVED_TIME = 0.2
 class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
-    The instances of a frame continue tracks in six stages, each an optimal assignment. Instances with a class continue
-    confirmed tracks with a class, then resting and lost tracks, then all other tracks. Instances without a class
-    continue tracks without a class, then those with one, then resting and lost tracks. An instance that was propagated
-    continues its own track.
+    The instances of a frame continue tracks in four stages, each an optimal assignment. Instances with a class continue
+    confirmed, resting and lost tracks with a class, then all other tracks. Instances without a class continue tracks
+    without a class, then those with one. An instance that was propagated continues its own track.
 
     If an object is not detected any more and may move, its mask is predicted for a short time. An object that does not
     move has no mask in this time, because tracking uses its pixels; it is called resting. Afterwards both are lost:
@@ -219,51 +218,43 @@ class InstanceTracker(torch.nn.Module):
         Returns:
             Track of each other instance that continues one, by its index.
         """
-        matches: dict[int, Track] = {}
         if len(detected) == len(matched):
-            return matches
-        tracks = predicted.tracks
+            return {}
+        without_masks = [*self.resting, *self.lost]
+        tracks = [*predicted.tracks, *without_masks]
+        evidence = torch.cat(
+            [
+                compare_tracks(predicted, detected, self._config),
+                compare_without_masks(without_masks, detected, self._config),
+            ]
+        )
         labelled = detected.labels != UNLABELLED
-        evidence = _compare(predicted, detected, self._config)
         named = torch.tensor([track.label != UNLABELLED for track in tracks], dtype=torch.bool)
-        confirmed = named & torch.tensor([track.is_confirmed for track in tracks], dtype=torch.bool)
+        established = torch.tensor([track.is_confirmed or track in self.resting for track in tracks], dtype=torch.bool)
         free_instances = torch.tensor([j not in matched for j in range(len(detected))])
         free_tracks = torch.ones(len(tracks), dtype=torch.bool)
+        matches: dict[int, Track] = {}
 
         def assign(rows: Tensor, columns: Tensor) -> None:
             for i, j in _assign(evidence, rows & free_tracks, columns & free_instances):
                 matches[j] = tracks[i]
                 free_tracks[i], free_instances[j] = False, False
 
-        def assign_without_masks(columns: Tensor) -> None:
-            for track, j in self._match_without_masks(detected, columns & free_instances):
-                matches[j] = track
-                free_instances[j] = False
-
-        assign(confirmed, labelled)
-        assign_without_masks(labelled)
-        assign(~confirmed, labelled)
+        assign(named & established, labelled)
+        assign(~(named & established), labelled)
         assign(~named, ~labelled)
         assign(named, ~labelled)
-        assign_without_masks(~labelled)
+        self._restart_tracks(matches.values(), detected.stamp)
         return matches
 
-    def _match_without_masks(self, detected: DetectedInstances, columns: Tensor) -> list[tuple[Track, int]]:
-        """Match instances to resting and lost tracks, which are tracked again; return the pairs."""
-        labels = set(detected.labels[columns].tolist())
-        candidates = [track for track in (*self.resting, *self.lost) if track.label in labels]
-        if not candidates:
-            return []
-        evidence = compare_without_masks(candidates, detected, self._config)
-        pairs = _assign(evidence, torch.ones(len(candidates), dtype=torch.bool), columns)
-        found = [(candidates[i], j) for i, j in pairs]
-        for track, _ in found:
+    def _restart_tracks(self, matched: Iterable[Track], stamp: float) -> None:
+        """Track the matched ones of the resting and lost tracks again."""
+        for track in matched:
             if track in self.lost:
-                track.restart(detected.stamp)
+                track.restart(stamp)
                 self.lost.remove(track)
-            else:
+            elif track in self.resting:
                 self.resting.remove(track)
-        return found
 
     def _is_duplicate(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
         """Check whether an instance shows the object of a matched instance of the same class, or a part of it."""
@@ -345,12 +336,6 @@ class InstanceTracker(torch.nn.Module):
         same_class = torch.tensor([[track.label == other.label for other in with_centroid] for track in tracks])
         covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
         return covered
-
-
-def _compare(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    if not predicted.tracks:
-        return torch.zeros(0, len(detected), dtype=torch.float64)
-    return compare_tracks(predicted, detected, config)
 
 
 def _assign(evidence: Tensor, rows: Tensor, columns: Tensor) -> list[tuple[int, int]]:

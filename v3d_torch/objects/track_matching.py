@@ -162,6 +162,8 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     Returns:
         Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
     """
+    if not predicted.tracks:
+        return torch.zeros(0, len(detected), dtype=torch.float64)
     # The last mask is accurate if little moves; the predicted mask follows fast walkers and a turning camera.
     last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
     intersection = count_common_pixels(predicted.masks, detected.masks)
@@ -176,11 +178,12 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     same_class = _same_class(predicted.tracks, detected)
     beside = predicted.visible[:, None] & (coverage < _MAX_BESIDE_COVERAGE)
     states = [track.predict_state(detected.stamp) for track in predicted.tracks]
-    near = _within_gate(predicted.tracks, states, detected, config) & ~beside
+    squared_distance = _squared_distances(states, detected)
+    near = _within_gate(squared_distance, predicted.tracks, detected, config) & ~beside
     possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
     visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
     evidence = (
-        _position_evidence(predicted.tracks, states, detected, possible)
+        _position_evidence(squared_distance, predicted.tracks, states, detected, possible)
         + overlap_log_ratio(coverage, overlap, visible)
         + _appearance_evidence(predicted.tracks, detected, [len(track.newest.cloud) for track in predicted.tracks])
         + class_log_ratio(same_class)
@@ -203,28 +206,40 @@ def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, 
     Returns:
         Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
     """
+    if not tracks:
+        return torch.zeros(0, len(detected), dtype=torch.float64)
     same_class = _same_class(tracks, detected)
     states = [track.predict_unobserved_state(detected.stamp) for track in tracks]
-    possible = same_class & _within_gate(tracks, states, detected, config)
+    squared_distance = _squared_distances(states, detected)
+    possible = same_class & _within_gate(squared_distance, tracks, detected, config)
     evidence = (
-        _position_evidence(tracks, states, detected, possible)
+        _position_evidence(squared_distance, tracks, states, detected, possible)
         + _appearance_evidence(tracks, detected, [track.appearance_points for track in tracks])
         + class_log_ratio(same_class)
     )
     return evidence.masked_fill(~possible, -torch.inf)
 
 
+def _squared_distances(states: Sequence[ObjectState], detected: DetectedInstances) -> Tensor:
+    """Squared distance of each centroid from each predicted position, square metres, NaN if unknown, shape (T, N)."""
+    predicted = torch.stack([state.position for state in states])
+    observed = torch.stack([detection.centroid for detection in detected.detections])
+    return (observed - predicted[:, None]).square().sum(dim=2)
+
+
 def _position_evidence(
-    tracks: Sequence[Track], states: Sequence[ObjectState], detected: DetectedInstances, possible: Tensor
+    squared_distance: Tensor,
+    tracks: Sequence[Track],
+    states: Sequence[ObjectState],
+    detected: DetectedInstances,
+    possible: Tensor,
 ) -> Tensor:
     """Evidence of the positions of possible pairs with the predicted states, 0 for other pairs, shape (T, N)."""
-    squared_distance = torch.full(possible.shape, torch.nan, dtype=torch.float64)
     variance = torch.ones_like(squared_distance)
+    variances = variance.numpy()  # NumPy is faster than torch for single elements
     for i, j in possible.nonzero().tolist():
-        detection = detected.detections[j]
-        squared_distance[i, j] = (detection.centroid - states[i].position).square().sum()
-        variance[i, j] = states[i].variances[0] + tracks[i].centroid_sigma(detection) ** 2
-    return position_log_ratio(squared_distance, variance)
+        variances[i, j] = states[i].variances[0] + tracks[i].centroid_sigma(detected.detections[j]) ** 2
+    return position_log_ratio(squared_distance.masked_fill(~possible, torch.nan), variance)
 
 
 def _appearance_evidence(
@@ -247,12 +262,10 @@ def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
 
 
 def _within_gate(
-    tracks: Sequence[Track], states: Sequence[ObjectState], detected: DetectedInstances, config: TrackerConfig
+    squared_distance: Tensor, tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig
 ) -> Tensor:
     """Mask of the pairs whose distance is within the maximum motion of the track, bool, shape (T, N)."""
-    predicted = torch.stack([state.position for state in states])
-    observed = torch.stack([detection.centroid for detection in detected.detections])
-    return torch.cdist(predicted, observed) <= config.max_jump + config.max_speed * _elapsed(tracks, detected)
+    return squared_distance.sqrt() <= config.max_jump + config.max_speed * _elapsed(tracks, detected)
 
 
 def _elapsed(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
