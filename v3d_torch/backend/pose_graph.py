@@ -186,7 +186,10 @@ class _Graph(NamedTuple):
         return torch.where(self.is_fixed, T_wc, T_wc @ se3_exp(xi))
 
     def differentiate(self, T_wc: Tensor, initial: Tensor) -> Tensor:
-        """Return zero steps at the optimum, with derivatives by measurements and by the fixed poses of ``initial``."""
+        """Return zero steps at the optimum, with derivatives.
+
+        They are those with respect to the measurements and to the fixed poses of ``initial``.
+        """
         constant = self.detach()
         ends = constant._ends(T_wc)
         blocks = jacobian(lambda xi: constant._gradient(ends, xi), T_wc.new_zeros(*self.edges.shape[:-1], 12))

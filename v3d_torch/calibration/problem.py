@@ -65,7 +65,8 @@ class AdjustedMap(NamedTuple):
     Attributes:
         T_cw: World-to-camera poses, float64, shape :math:`(K, 4, 4)`.
         points: Landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
-        gradient: First derivatives of each keyframe's cost by the parameters, float64, shape :math:`(K, C)`.
+        gradient: First derivatives of each keyframe's cost with respect to the parameters, float64, shape
+            :math:`(K, C)`.
         hessian: Second derivatives, shape :math:`(K, C, C)`.
     """
 
@@ -203,7 +204,7 @@ class SelfCalibration:
         return _whitened_residuals(*self._measured_with(names, values), T_cw, points)
 
     def jacobian(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
-        """Derivatives of the whitened residuals by the parameters, by central differences, shape :math:`(C, 3, M)`."""
+        """Derivatives of the whitened residuals with respect to the parameters, numerical, shape :math:`(C, 3, M)`."""
         rows = []
         for index, name in enumerate(names):
             step = torch.zeros_like(values).index_fill_(0, torch.tensor(index), DERIVATIVE_STEPS[name])

@@ -10,7 +10,7 @@ from v3d_torch.mapping.bundle_problem import BundleProblem, State
 
 @torch.no_grad()
 def differentiate_minimum_cost(problem: BundleProblem, state: State, jacobian: Tensor) -> tuple[Tensor, Tensor]:
-    """Derivatives of the minimum cost by parameters of the camera, as sums over the observations of each pose.
+    """Derivatives of the minimum cost with respect to camera parameters, as sums over the observations of each pose.
 
     The second derivatives are twice the Schur complement of poses and points, which is the information on the
     parameters if poses and points are unknown (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
@@ -18,7 +18,7 @@ def differentiate_minimum_cost(problem: BundleProblem, state: State, jacobian: T
     Args:
         problem: Bundle adjustment of P poses, without batch dimensions.
         state: Poses and points, which need not be at the minimum.
-        jacobian: Derivatives of the whitened residuals by C parameters, float64, shape :math:`(C, 3, M)`.
+        jacobian: Derivatives of the whitened residuals with respect to C parameters, float64, shape :math:`(C, 3, M)`.
 
     Returns:
         First derivatives, shape :math:`(P, C)`, and second derivatives, shape :math:`(P, C, C)`. Their sums over the

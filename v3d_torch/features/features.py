@@ -28,8 +28,8 @@ class Features:
         octave: Octaves, int64, shape :math:`(N,)`. As for OpenCV's key points, the step between octaves is
             ``features.scale``, not 2. Octave 0 is the image; the pyramid of a large image begins at a higher one.
         descriptors: 256-bit descriptors, uint8, shape :math:`(N, 32)`.
-        readout_jacobian: Derivative of ``uv`` by the readout time of a rolling shutter, pixels per second, float64,
-            shape :math:`(N, 2)`; 0 if not given, as for a camera at rest.
+        readout_jacobian: Derivative of ``uv`` with respect to the readout time of a rolling shutter, pixels per second,
+            float64, shape :math:`(N, 2)`; 0 if not given, as for a camera at rest.
         sigma_ratio: Standard deviations of the pixel and of the inverse depth, relative to those of the configuration,
             positive, float64, shape :math:`(N, 2)`; 1 if not given. A detector of your own can set it.
     """

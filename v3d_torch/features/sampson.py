@@ -80,7 +80,7 @@ class EpipolarProblem(NamedTuple):
         return (line_b * self.b).sum(dim=-1) / _length(line_a, line_b)
 
     def jacobian(self, state: State) -> Tensor:
-        """Derivatives of the Sampson distances by the update of `_move`, (..., 5, N)."""
+        """Derivatives of the Sampson distances with respect to the update of `_move`, (..., 5, N)."""
         (U, V), E = state, compose(*state)
         axes = torch.cat([torch.eye(3, dtype=U.dtype, device=U.device).expand_as(U), V[..., :2].mT], dim=-2)
         turns = hat(torch.cat([torch.zeros_like(axes), axes], dim=-1))[..., :3, :3]  # 5 x 3 x 3

@@ -22,7 +22,7 @@ from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.kernels.reprojection import SMALL_ANGLE
 from v3d_torch.kernels.se3 import SERIES_ANGLE_SQUARED
 
-# Generators of se(3): row k is the derivative of se3_exp by xi[k] at 0, a flattened 4x4 matrix.
+# Generators of se(3): row k is the derivative of se3_exp with respect to xi[k] at 0, a flattened 4x4 matrix.
 _GENERATORS = torch.zeros(6, 4, 4, dtype=torch.float64)
 _GENERATORS[(0, 1, 2), (0, 1, 2), 3] = 1.0
 _GENERATORS[(3, 4, 5), (2, 0, 1), (1, 2, 0)] = 1.0
@@ -114,7 +114,7 @@ def orthonormalise(T: Tensor) -> Tensor:
 
 
 def differentiable_rotation(R: Tensor, M: Tensor) -> Tensor:
-    """Return the rotations that are nearest to matrices with their derivatives by these matrices.
+    """Return the rotations that are nearest to matrices with their derivatives with respect to these matrices.
 
     The derivatives are computed from the maximum of trace(R^T M) by the implicit function theorem, so that they are
     finite even where singular vectors have none: a rotation has three equal singular values.
@@ -287,7 +287,7 @@ def adjoint(T: Tensor) -> Tensor:
 
 
 def left_jacobian_inverse(xi: Tensor) -> Tensor:
-    r"""Inverse left Jacobian of SE(3), the derivative of the logarithm by a perturbation on the left.
+    r"""Inverse left Jacobian of SE(3), the derivative of the logarithm with respect to a perturbation on the left.
 
     With the adjoint :math:`A` of the tangent vector,
 

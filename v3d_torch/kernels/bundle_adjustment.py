@@ -39,7 +39,7 @@ def _linearise(
 ) -> None:  # fmt: skip
     """Write the blocks of the normal equations; the last columns of U and V are gradients, W is for free poses only."""
     U[:], V[:] = 0.0, 0.0
-    J = np.empty((3, 10))  # derivatives of a residual by pose and by point, and the residual
+    J = np.empty((3, 10))  # derivatives of a residual with respect to pose and point, and the residual
     for p in range(len(points)):
         for m in range(first[p], first[p + 1]):
             T, weight = T_cw[pose[m]], robust_weights[m]
@@ -142,7 +142,7 @@ def reduced_cost_derivatives(
     T_cw: Floats, points: Floats, scale: Floats, offset: Floats, thresholds: Floats, weights: Floats, pose: Ints,
     first: Ints, free: Ints, j: Floats, damping: float, regularisation: float, min_depth: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Derivatives of the minimum cost over poses and points by a parameter of the measurements.
+    """Derivatives of the minimum cost over poses and points with respect to a parameter of the measurements.
 
     Args:
         T_cw: Poses at the minimum, (K, 4, 4).
@@ -154,7 +154,7 @@ def reduced_cost_derivatives(
         pose: Pose of each observation, sorted by point, (M,).
         first: First observation of each point, and M, (P + 1,).
         free: Indices of the poses that move, (F,).
-        j: Derivative of the whitened residuals by the parameter, (M, 3).
+        j: Derivative of the whitened residuals with respect to the parameter, (M, 3).
         damping: Damping of the step that follows a change of the parameter.
         regularisation: Added to the diagonal of the normal equations.
         min_depth: Smallest depth of a projected point, metres.

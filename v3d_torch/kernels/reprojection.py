@@ -35,7 +35,7 @@ def huber(squared: float, threshold: float) -> tuple[float, float]:
 
 @device
 def perspective_jacobian(a: float, b: float, w: float, J: Floats) -> None:
-    """Write the derivatives of (a, b, w) = (x/z, y/z, 1/z) by the left perturbation of the pose to ``J``, (3, 6)."""
+    """Write to ``J``, (3, 6): derivatives of (x/z, y/z, 1/z) with respect to the left perturbation of the pose."""
     J[0, 0], J[0, 1], J[0, 2], J[0, 3], J[0, 4], J[0, 5] = w, 0.0, -w * a, -b * a, a * a + 1, -b
     J[1, 0], J[1, 1], J[1, 2], J[1, 3], J[1, 4], J[1, 5] = 0.0, w, -w * b, -b * b - 1, a * b, a
     J[2, 0], J[2, 1], J[2, 2], J[2, 3], J[2, 4], J[2, 5] = 0.0, 0.0, -w * w, -b * w, a * w, 0.0

@@ -27,7 +27,7 @@ def _fundamental(U: Floats, V: Floats, K_inverse: Floats) -> Floats:
 
 @device
 def _tangents(U: Floats, V: Floats, K_inverse: Floats) -> Floats:
-    """Derivatives of the fundamental matrix by the five parameters of an update, (5, 3, 3)."""
+    """Derivatives of the fundamental matrix with respect to the five parameters of an update, (5, 3, 3)."""
     G, axes = np.empty((5, 3, 3)), np.zeros((5, 3))
     for i in range(3):
         axes[i, i], axes[3, i], axes[4, i] = 1.0, V[i, 0], V[i, 1]

@@ -141,7 +141,7 @@ def _write_skew(x: float, y: float, z: float, matrix: Floats, row: int, column: 
 
 @device
 def right_jacobian_inverse(xi: Floats) -> Floats:
-    """Derivative of a logarithm by a perturbation on the right, (6, 6); see `left_jacobian_inverse` of ``-xi``."""
+    """Derivative of a logarithm with respect to a right perturbation, (6, 6): `left_jacobian_inverse` of ``-xi``."""
     A, J = np.zeros((6, 6)), np.eye(6)
     _write_skew(xi[3], xi[4], xi[5], A, 0, 0)
     _write_skew(xi[3], xi[4], xi[5], A, 3, 3)

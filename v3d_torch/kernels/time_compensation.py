@@ -58,7 +58,7 @@ def compensate_rolling_shutter(
     uv: Floats, row: Floats, inverse_depth: Floats, velocity: Floats, K: Floats, readout_jacobian: Floats,
     readout: float, rows: int,
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    """Pixels of features at the time of the middle row, and their derivatives by the readout, both (N, 2).
+    """Pixels of features at the time of the middle row, and their derivatives with respect to the readout, both (N, 2).
 
     Args:
         uv: Undistorted pixels, compensated with ``readout_jacobian``, (N, 2).

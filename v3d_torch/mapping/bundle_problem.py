@@ -97,9 +97,9 @@ class BundleProblem(NamedTuple):
     def remaining(self, residuals: BundleResiduals, derivative: Tensor, point_count: int) -> Tensor:
         r"""Part of a change of the residuals that no change of poses and points explains.
 
-        With the Jacobian :math:`J` by poses and points, the remaining part of a change :math:`j` of the residuals is
-        :math:`j - J (J^T W J)^{-1} J^T W j`. Twice its products with :math:`W r` and :math:`W j` are the derivatives of
-        the minimum cost (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
+        With the Jacobian :math:`J` with respect to poses and points, the remaining part of a change :math:`j` of the
+        residuals is :math:`j - J (J^T W J)^{-1} J^T W j`. Twice its products with :math:`W r` and :math:`W j` are
+        the derivatives of the minimum cost (Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000).
 
         Args:
             residuals: Residuals at the poses and points of the linearisation.
@@ -122,7 +122,10 @@ class BundleProblem(NamedTuple):
         return self._move(state, solve_normal_equations(self.linearise(residuals, state[1].shape[-2]), damping))
 
     def differentiate(self, state: State, T_cw: Tensor) -> State:
-        """Return the optimum ``state`` with derivatives by measurements, weights and the fixed poses in ``T_cw``."""
+        """Return the optimum ``state`` with derivatives.
+
+        They are those with respect to the measurements, the weights and the fixed poses in ``T_cw``.
+        """
         constant = self.detach()
         T, X = constant._gather(state)
 
@@ -161,7 +164,7 @@ class BundleProblem(NamedTuple):
         return cost, BundleResiduals(in_camera, projected, R, whitened, weights * self.weights)
 
     def _jacobian(self, residuals: BundleResiduals) -> Tensor:
-        """Derivatives of the whitened residuals by the nine unknowns of their observation, (..., 9, 3, M)."""
+        """Derivatives of whitened residuals with respect to the nine unknowns of an observation, (..., 9, 3, M)."""
         by_pose = perspective_jacobian(residuals.projected) * self.scale[..., None, :, :]
         by_point = (residuals.R_cw[..., :, :, None, :] * by_pose[..., :3, None, :, :]).sum(dim=-4)
         return torch.cat([by_pose, by_point], dim=-3)

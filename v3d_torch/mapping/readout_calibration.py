@@ -66,8 +66,8 @@ def estimate_readout(
             a number or shape :math:`(*)`.
         information: Inverse variance of ``seconds``, 1/s^2, a number or shape :math:`(*)`; infinite if the readout is
             known.
-        readout_jacobian: Derivatives of ``uv`` by the readout, pixels per second, shape :math:`(*, M, 2)`; see
-            :func:`compensate_rolling_shutter`.
+        readout_jacobian: Derivatives of ``uv`` with respect to the readout, pixels per second, shape :math:`(*, M, 2)`;
+            see :func:`compensate_rolling_shutter`.
         T_cw: Poses at the minimum of the bundle adjustment, shape :math:`(*, P, 4, 4)`. These and all other arguments
             are those of :func:`bundle_adjust`.
         points: Landmarks at the minimum, world frame, metres, shape :math:`(*, L, 3)`.
@@ -121,8 +121,9 @@ def combine_readouts(
     Args:
         seconds: Readout at which the cost was differentiated, shape :math:`(...)`.
         information: Inverse variance of ``seconds``, 1/s^2, shape :math:`(...)`.
-        slope: First derivative of the cost, twice the negative log-likelihood, by the readout, shape :math:`(...)`.
-        curvature: Second derivative of the cost by the readout, shape :math:`(...)`.
+        slope: First derivative of the cost, twice the negative log-likelihood, with respect to the readout, shape
+            :math:`(...)`.
+        curvature: Second derivative of the cost with respect to the readout, shape :math:`(...)`.
         unadjusted_curvature: Second derivative with poses and points that stay unchanged, shape :math:`(...)`.
 
     Returns:

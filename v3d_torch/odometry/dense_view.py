@@ -28,7 +28,7 @@ class LevelCamera:
 
     Attributes:
         camera: Intrinsics at the size of the level.
-        distortion_jacobian: Derivative of distorted by undistorted pixels at every pixel, float32, shape
+        distortion_jacobian: Derivative of distorted with respect to undistorted pixels at every pixel, float32, shape
             :math:`(H, W, 2, 2)`: a gradient by distorted pixels (row vector) times this matrix is the gradient by
             undistorted pixels.
     """
@@ -61,7 +61,7 @@ class LevelCamera:
 
 @dataclass(frozen=True)
 class ReferencePoints:
-    """Points of a reference view on one pyramid level, with their Jacobians by ``xi`` in ``T_ba @ exp(xi)``.
+    """Points of a reference view on one pyramid level, and Jacobians with respect to ``xi`` in ``T_ba @ exp(xi)``.
 
     Attributes:
         points: Points in the camera frame of the reference, metres, float32, shape :math:`(M, 3)`.

@@ -172,8 +172,8 @@ def compensate_rolling_shutter(
         valid: Mask of the pixels that are not padding, bool, shape :math:`(*, N)`; None for all.
 
     Returns:
-        Pixels, and their derivatives by the readout (pixels per second), both with the dtype of ``uv``, float32 for
-        integers, and of shape :math:`(*, N, 2)`; 0 for padding.
+        Pixels, and their derivatives with respect to the readout (pixels per second), both with the dtype of ``uv``,
+        float32 for integers, and of shape :math:`(*, N, 2)`; 0 for padding.
 
     Raises:
         InputError: If ``valid`` is not bool.

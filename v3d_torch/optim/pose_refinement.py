@@ -112,7 +112,10 @@ class _Problem(NamedTuple):
         return self.residuals_at(se3_exp(-torch.linalg.solve(damped, gradient)) @ at.T_cw)
 
     def differentiate(self, T_cw: Tensor, active: Tensor, *, robust: bool) -> Tensor:
-        """Return the optimum ``T_cw`` of the active measurements, with derivatives by points, measurements, weights."""
+        """Return the optimum ``T_cw`` of the active measurements, with derivatives.
+
+        They are those with respect to the points, the measurements and the weights.
+        """
 
         def gradient(xi: Tensor, problem: _Problem) -> Tensor:
             at = problem.residuals_at(se3_exp(xi) @ T_cw)

@@ -169,14 +169,14 @@ def perspective(points: Tensor) -> Tensor:
 
 
 def perspective_jacobian(projected: Tensor) -> Tensor:
-    """Derivatives of `perspective` by the left perturbation of ``T_cw``.
+    """Derivatives of `perspective` with respect to the left perturbation of ``T_cw``.
 
     Args:
         projected: Points projected by `perspective`, shape :math:`(..., 3, M)`.
 
     Returns:
-        Derivatives by translation, then rotation, shape :math:`(..., 6, 3, M)`; the derivatives by translation equal
-        those by the points.
+        Derivatives with respect to translation, then rotation, shape :math:`(..., 6, 3, M)`; the first three equal
+        those with respect to the point.
     """
     a, b, w = projected.unbind(dim=-2)  # (x/z, y/z, 1/z)
     o = torch.zeros_like(w)
@@ -207,7 +207,7 @@ def reprojection_residuals(points: Tensor, measured: Measurements, K: Tensor) ->
 
 
 def reprojection_jacobian(points: Tensor, measured: Measurements, K: Tensor) -> Tensor:
-    """Jacobian of the whitened reprojection residuals by the left perturbation of ``T_cw``.
+    """Jacobian of the whitened reprojection residuals with respect to the left perturbation of ``T_cw``.
 
     Args:
         points: Landmark of each measurement in the camera frame, metres, shape :math:`(..., M, 3)`.
@@ -215,8 +215,8 @@ def reprojection_jacobian(points: Tensor, measured: Measurements, K: Tensor) -> 
         K: Camera matrix, shape :math:`(..., 3, 3)`.
 
     Returns:
-        Jacobian, shape :math:`(..., M, 3, 6)`; the first three columns are also the Jacobian by ``points``. The tensor
-        is a transposed view, with the measurements contiguous in memory.
+        Jacobian, shape :math:`(..., M, 3, 6)`; the first three columns are also that with respect to ``points``.
+        The tensor is a transposed view, with the measurements contiguous in memory.
     """
     scale = whiten(measured, K).scale
     return (perspective_jacobian(perspective(points.mT)) * scale[..., None, :, :]).movedim(-1, -3).mT
