@@ -384,7 +384,7 @@ class V3DSLAM(FramePreprocessor):
         return [self.map.landmarks["point"], *newest, *self._landmarks_outside_of_map()]
 
     def _landmarks_outside_of_map(self) -> list[Tensor]:
-        """Landmark IDs stored outside of the map, -1 for none, int64, updated in place when the map is compacted."""
+        """Landmark ids stored outside of the map, -1 for none, int64, updated in place when the map is compacted."""
         previous = None if self._previous is None else self._previous.landmarks
         return [self.poses.observed_landmarks] if previous is None else [self.poses.observed_landmarks, previous]
 

@@ -155,7 +155,7 @@ class Instances:
         labels: COCO class index (0 = person, 0..79; -1 = unlabelled), int64, shape :math:`(N,)`.
         scores: Confidence in [0, 1], float32, shape :math:`(N,)`.
         boxes: Left, top, right and bottom edge, pixels, float32, shape :math:`(N, 4)`.
-        track_ids: ID of the track that each instance continues, 0 if it is not known, int64, shape :math:`(N,)`; None
+        track_ids: Id of the track that each instance continues, 0 if it is not known, int64, shape :math:`(N,)`; None
             if none is known, as from a segmenter.
     """
 
@@ -190,7 +190,7 @@ class Instances:
         )
 
     def _known_ids(self) -> Tensor:
-        """Return the track IDs, all 0 if none is known."""
+        """Return the track ids, all 0 if none is known."""
         return torch.zeros_like(self.labels) if self.track_ids is None else self.track_ids
 
     @staticmethod
@@ -239,7 +239,7 @@ class FramePose:
     Attributes:
         status: Source of the pose.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-        landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
+        landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
         information: Information matrix of the left perturbation of ``T_cw``, under the assumption that the errors of
             the features are independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
         is_relocalised: True if the camera was found again in the map. The change of the pose since the previous frame
@@ -254,7 +254,7 @@ class FramePose:
 
     @property
     def observed_landmarks(self) -> Tensor:
-        """IDs of the landmarks that the frame observes, int64, shape :math:`(F,)`."""
+        """Ids of the landmarks that the frame observes, int64, shape :math:`(F,)`."""
         return self.landmarks[self.landmarks >= 0]
 
     @property

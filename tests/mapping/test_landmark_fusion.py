@@ -56,7 +56,7 @@ class Room:
         return self.map.insert_keyframe(index, index / 30, T_cw, observed, landmarks)
 
     def landmarks_of(self, point: int) -> set[int]:
-        """IDs of the landmarks of a point in all keyframes."""
+        """Ids of the landmarks of a point in all keyframes."""
         keyframes = zip(self.map.keyframes, self.feature_points, strict=True)
         return {int(landmark) for keyframe, points in keyframes for landmark in keyframe.landmarks[points == point]}
 
@@ -67,7 +67,7 @@ class Room:
 
 
 def assert_consistent(sparse_map: SparseMap) -> None:
-    """Check that the table of observations agrees with the landmark IDs of the keyframes."""
+    """Check that the table of observations agrees with the landmark ids of the keyframes."""
     table = sparse_map.observations
     rows = torch.nonzero(table["valid"])[:, 0]
     in_table = sorted(zip(*(table[name][rows].tolist() for name in ("keyframe", "feature", "landmark")), strict=True))

@@ -60,7 +60,7 @@ def test_relocalisation_in_a_loaded_map_equals_the_original_run(wall: tuple[Path
     assert before is not None and after is not None
     assert after.keyframe.index == before.keyframe.index
     assert torch.equal(after.tracking.T_cw, before.tracking.T_cw)
-    # The same landmarks, whose IDs are new because the file leaves out those that are not in use.
+    # The same landmarks, whose ids are new because the file leaves out those that are not in use.
     own, other = after.tracking.landmarks, before.tracking.landmarks
     is_matched = own >= 0
     assert torch.equal(is_matched, other >= 0)

@@ -36,7 +36,7 @@ class KeyframeDatabase:
 
     def _clear(self) -> None:
         self._index = faiss.IndexBinaryHash(_DESCRIPTOR_BITS, _KEY_BITS)
-        self._descriptors: dict[int, Tensor] = {}  # by keyframe ID, in the order of the index, with removed keyframes
+        self._descriptors: dict[int, Tensor] = {}  # by keyframe id, in the order of the index, with removed keyframes
         self._owner = np.zeros(0, dtype=np.int64)  # for each descriptor in the index, position of its keyframe
         self._removed: set[int] = set()
 
@@ -48,7 +48,7 @@ class KeyframeDatabase:
         """Add a keyframe.
 
         Args:
-            keyframe: ID of the keyframe, not added before.
+            keyframe: Id of the keyframe, not added before.
             descriptors: ORB descriptors of the keyframe, uint8, shape :math:`(N, 32)`.
         """
         self._index.add(descriptors.contiguous().numpy())
@@ -56,7 +56,7 @@ class KeyframeDatabase:
         self._descriptors[keyframe] = descriptors
 
     def remove(self, keyframes: Iterable[int]) -> None:
-        """Remove keyframes, given by their IDs; IDs that are not in the database are ignored."""
+        """Remove keyframes, given by their ids; ids that are not in the database are ignored."""
         self._removed |= self._descriptors.keys() & set(keyframes)
         # The index cannot delete descriptors: rebuild it when most of its keyframes are removed.
         if len(self._removed) > len(self):
@@ -71,10 +71,10 @@ class KeyframeDatabase:
         Args:
             descriptors: ORB descriptors of the query image, uint8, shape :math:`(N, 32)`.
             k: Maximum number of keyframes.
-            exclude: IDs of keyframes that are not returned, such as recent or covisible ones.
+            exclude: Ids of keyframes that are not returned, such as recent or covisible ones.
 
         Returns:
-            Pairs (ID, score) with score > 0, best first; of equal scores, the keyframe added earlier is first. The
+            Pairs (id, score) with score > 0, best first; of equal scores, the keyframe added earlier is first. The
             score is the mean weighted vote of a descriptor. It ranks the keyframes of one query; it is not a
             probability.
         """

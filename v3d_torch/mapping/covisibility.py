@@ -16,7 +16,7 @@ def count_shared_landmarks(tables: MapTables, landmarks: Tensor) -> Tensor:
 
     Args:
         tables: Data of the map.
-        landmarks: IDs, int64, shape :math:`(L,)`.
+        landmarks: Ids, int64, shape :math:`(L,)`.
 
     Returns:
         Number of shared landmarks of each keyframe, int64, shape :math:`(K,)`.
@@ -33,7 +33,7 @@ def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Ten
 
     Args:
         tables: Data of the map.
-        landmarks: IDs, int64, shape :math:`(L,)`.
+        landmarks: Ids, int64, shape :math:`(L,)`.
         count: Maximum number of keyframes.
 
     Returns:
@@ -56,7 +56,7 @@ def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
         keyframes: Indices of keyframes, int64, shape :math:`(K,)`.
 
     Returns:
-        IDs, ascending, int64, shape :math:`(L,)`.
+        Ids, ascending, int64, shape :math:`(L,)`.
     """
     # Without the removed observations, tracking was less accurate where unmasked people move.
     keyframe, landmark = (tables.observations[name].numpy() for name in ("keyframe", "landmark"))

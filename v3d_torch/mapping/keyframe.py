@@ -21,8 +21,8 @@ class Keyframe:
         stamp: Timestamp, seconds.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`; changed by bundle adjustment and loop correction.
         features: Features on static pixels; empty once the keyframe is culled.
-        landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
-        part: ID of the part of the map to which the keyframe belongs. Part 0 is where the map starts. A lost camera
+        landmarks: Id of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
+        part: Id of the part of the map to which the keyframe belongs. Part 0 is where the map starts. A lost camera
             starts another part, whose pose relative to the other parts is only a guess until a loop joins two parts.
         reference: Index of the reference keyframe. A culled keyframe moves rigidly with its reference keyframe; every
             other keyframe is its own reference.
@@ -58,7 +58,7 @@ class Keyframe:
 
     @property
     def observed_landmarks(self) -> Tensor:
-        """IDs of the observed landmarks, int64, shape :math:`(L,)`."""
+        """Ids of the observed landmarks, int64, shape :math:`(L,)`."""
         return self.landmarks[self.landmarks >= 0]
 
 

@@ -20,7 +20,7 @@ def select_new_landmarks(features: Features, landmarks: Tensor, max_landmarks: i
 
     Args:
         features: Features of the keyframe.
-        landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
+        landmarks: Id of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
         max_landmarks: Maximum number of landmarks that the keyframe observes, matched and new.
         cell: Side of a grid cell for the even selection, pixels.
 
@@ -60,7 +60,7 @@ def create_landmarks(
         pyramid: Scale pyramid of the features.
 
     Returns:
-        IDs of the new landmarks, int64, shape :math:`(N,)`.
+        Ids of the new landmarks, int64, shape :math:`(N,)`.
     """
     T_wc = invert(T_cw)
     points = landmark_points(T_wc, features, camera)

@@ -1,4 +1,4 @@
-"""Landmark IDs: merging of duplicate landmarks, and compaction of the landmark table."""
+"""Landmark ids: merging of duplicate landmarks, and compaction of the landmark table."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
 
     Args:
         tables: Data of the map.
-        kept: ID of the landmark of each pair that remains, int64, shape :math:`(L,)`.
-        merged: ID of the landmark of each pair that becomes inactive, int64, shape :math:`(L,)`. No ID occurs twice
+        kept: Id of the landmark of each pair that remains, int64, shape :math:`(L,)`.
+        merged: Id of the landmark of each pair that becomes inactive, int64, shape :math:`(L,)`. No id occurs twice
             in ``kept`` and ``merged``.
     """
     if len(kept) == 0:
@@ -60,12 +60,12 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:
     """Remove the landmarks that are not in use from the table, if these are most of its rows.
 
-    Memory and time then depend on the current size of the map, not on its history. The other landmarks get new IDs in
+    Memory and time then depend on the current size of the map, not on its history. The other landmarks get new ids in
     the order of the old ones; nothing else changes.
 
     Args:
         tables: Data of the map.
-        external_ids: Landmark IDs stored outside of the map, -1 for none, int64; updated in place.
+        external_ids: Landmark ids stored outside of the map, -1 for none, int64; updated in place.
     """
     external_ids = list(external_ids)
     in_use = find_landmarks_in_use(tables, external_ids)
@@ -80,11 +80,11 @@ def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None
 
 
 def find_landmarks_in_use(tables: MapTables, external_ids: Iterable[Tensor] = ()) -> Tensor:
-    """Find the landmarks that are active or that an observation, a keyframe or another ID refers to.
+    """Find the landmarks that are active or that an observation, a keyframe or another id refers to.
 
     Args:
         tables: Data of the map.
-        external_ids: Landmark IDs stored outside of the map, -1 for none, int64.
+        external_ids: Landmark ids stored outside of the map, -1 for none, int64.
 
     Returns:
         Mask of the landmarks, bool, shape :math:`(L,)`.
@@ -95,9 +95,9 @@ def find_landmarks_in_use(tables: MapTables, external_ids: Iterable[Tensor] = ()
 
 
 def compacted_ids(in_use: Tensor) -> Tensor:
-    """Return the new ID of each landmark if only those in use remain, int64, shape :math:`(L + 1,)`.
+    """Return the new id of each landmark if only those in use remain, int64, shape :math:`(L + 1,)`.
 
-    The last element is -1, so that the ID of no landmark, -1, selects itself.
+    The last element is -1, so that the id of no landmark, -1, selects itself.
 
     Args:
         in_use: Mask of the landmarks, bool, shape :math:`(L,)`.
@@ -106,5 +106,5 @@ def compacted_ids(in_use: Tensor) -> Tensor:
 
 
 def _stored_ids(tables: MapTables) -> list[Tensor]:
-    """Landmark IDs stored in the map, -1 for none."""
+    """Landmark ids stored in the map, -1 for none."""
     return [tables.observations["landmark"], *(keyframe.landmarks for keyframe in tables.active_keyframes)]

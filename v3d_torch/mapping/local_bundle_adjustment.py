@@ -36,7 +36,7 @@ class LocalAdjustment:
 
     Attributes:
         T_cw: World-to-camera poses of all keyframes, adjusted or unchanged, float64, shape :math:`(K, 4, 4)`.
-        landmarks: IDs of the adjusted landmarks, int64, shape :math:`(P,)`.
+        landmarks: Ids of the adjusted landmarks, int64, shape :math:`(P,)`.
         points: Positions of the adjusted landmarks, world frame, metres, float64, shape :math:`(P, 3)`.
         outliers: Rows of the outliers in the table of observations, int64, shape :math:`(O,)`.
         readout: Estimate of the camera's readout after the adjustment.

@@ -38,7 +38,7 @@ _ROTATION_TOLERANCE = 5e-7
 def to_columns(tables: MapTables, views: StaticViews) -> dict[str, Tensor]:
     """Convert a map and its views to columns. An empty map gives empty columns of the right type and shape.
 
-    Landmarks that are not in use are left out; the IDs of the others are their rows in the columns.
+    Landmarks that are not in use are left out; the ids of the others are their rows in the columns.
 
     Args:
         tables: Data of the map.

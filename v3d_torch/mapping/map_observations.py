@@ -23,7 +23,7 @@ class MapObservations:
     Attributes:
         rows: Rows of the observations in the table of the map, int64, shape :math:`(M,)`.
         keyframes: Indices of the keyframes, ascending, int64, shape :math:`(P,)`.
-        landmarks: IDs of the landmarks, ascending, int64, shape :math:`(L,)`.
+        landmarks: Ids of the landmarks, ascending, int64, shape :math:`(L,)`.
         pose: Position of the keyframe of each observation in ``keyframes``, int64, shape :math:`(M,)`.
         point: Position of the landmark of each observation in ``landmarks``, int64, shape :math:`(M,)`.
         measured: Measured pixels and inverse depths.

@@ -16,7 +16,7 @@ from v3d_torch.runtime.tensor_table import TensorTable
 class MapTables:
     """Keyframes, landmarks and observations of a sparse map, without operations that need a camera.
 
-    A landmark ID is a row of ``landmarks``.
+    A landmark id is a row of ``landmarks``.
 
     Attributes:
         keyframes: All keyframes, also culled ones, in order of their index.
@@ -34,7 +34,7 @@ class MapTables:
         observations: Table of observations of landmarks by keyframes.
 
             - ``keyframe``: Index of the keyframe, int64.
-            - ``landmark``: ID of the landmark, int64.
+            - ``landmark``: Id of the landmark, int64.
             - ``feature``: Index of the feature in the keyframe, int64.
             - ``uv``: Undistorted pixel, float64, :math:`(2,)`.
             - ``readout_jacobian``: Derivative of ``uv`` with respect to the readout, pixels/s, float64, :math:`(2,)`.
@@ -95,7 +95,7 @@ class MapTables:
 
     @property
     def unused_part(self) -> int:
-        """ID of a part without keyframes, see `Keyframe`; not 0, which is the part where the map starts."""
+        """Id of a part without keyframes, see `Keyframe`; not 0, which is the part where the map starts."""
         return max((keyframe.part for keyframe in self.keyframes), default=0) + 1
 
     def keyframe_at(self, stamp: float) -> Keyframe | None:
@@ -111,11 +111,11 @@ class MapTables:
         return newest if is_at else None
 
     def join_parts(self, a: int, b: int) -> None:
-        """Join two parts, see `Keyframe`, in place; the joined part has the lower of both IDs.
+        """Join two parts, see `Keyframe`, in place; the joined part has the lower of both ids.
 
         Args:
-            a: ID of a part.
-            b: ID of a part; if it is the same, nothing changes.
+            a: Id of a part.
+            b: Id of a part; if it is the same, nothing changes.
         """
         for keyframe in self.keyframes:
             if keyframe.part == max(a, b):

@@ -1,4 +1,4 @@
-"""Membership in a set of landmark IDs or of indices of keyframes."""
+"""Membership in a set of landmark ids or of indices of keyframes."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 
 def contains(ids: NDArray[np.int64], queries: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    """Check which IDs are in a set, by a lookup table because `numpy.isin` sorts.
+    """Check which ids are in a set, by a lookup table because `numpy.isin` sorts.
 
     Args:
-        ids: IDs in the set, without -1, int64, shape :math:`(L,)`.
-        queries: IDs to check, -1 for none, int64, shape :math:`(N,)`.
-        count: Number of landmarks, or of keyframes, in the map: exclusive upper bound of the IDs.
+        ids: Ids in the set, without -1, int64, shape :math:`(L,)`.
+        queries: Ids to check, -1 for none, int64, shape :math:`(N,)`.
+        count: Number of landmarks, or of keyframes, in the map: exclusive upper bound of the ids.
 
     Returns:
         True for queries in the set, false for -1, bool, shape :math:`(N,)`.

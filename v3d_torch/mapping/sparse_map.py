@@ -59,7 +59,7 @@ class SparseMap(MapTables):
             stamp: Timestamp, seconds.
             T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
             features: Features on static pixels.
-            landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
+            landmarks: Id of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
 
         Returns:
             The new keyframe.
@@ -79,8 +79,8 @@ class SparseMap(MapTables):
         The counters stay unchanged if the map is used for localisation only.
 
         Args:
-            found: IDs of the landmarks that the frame matched, int64, shape :math:`(F,)`.
-            visible: IDs of the landmarks that the frame should have matched, int64, shape :math:`(V,)`.
+            found: Ids of the landmarks that the frame matched, int64, shape :math:`(F,)`.
+            visible: Ids of the landmarks that the frame should have matched, int64, shape :math:`(V,)`.
         """
         if self._config.enabled:
             self.landmarks["found"][found] += 1
@@ -90,7 +90,7 @@ class SparseMap(MapTables):
         """Return the local map: all landmarks that the most covisible keyframes observe or observed.
 
         Args:
-            landmarks: IDs of the landmarks that the previous frame observed, int64, shape :math:`(L,)`.
+            landmarks: Ids of the landmarks that the previous frame observed, int64, shape :math:`(L,)`.
             count: Maximum number of keyframes.
         """
         return self.select_landmarks(observed_landmarks(self, covisible_keyframes(self, landmarks, count)))
@@ -99,7 +99,7 @@ class SparseMap(MapTables):
         """Return the active landmarks among the given ones as a local map.
 
         Args:
-            landmarks: IDs, ascending, int64, shape :math:`(L,)`.
+            landmarks: Ids, ascending, int64, shape :math:`(L,)`.
         """
         ids = landmarks[self.landmarks["active"][landmarks]]
         # index_select is faster than indexing here.
@@ -113,7 +113,7 @@ class SparseMap(MapTables):
         """World positions of the landmarks matched to features.
 
         Args:
-            landmarks: ID of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
+            landmarks: Id of the landmark matched to each feature, -1 for none, int64, shape :math:`(N,)`.
 
         Returns:
             Indices of the features with an active landmark, int64, shape :math:`(L,)`, and the positions of the
@@ -200,7 +200,7 @@ class SparseMap(MapTables):
 
         Args:
             keyframe: Keyframe whose features were matched.
-            landmarks: ID of the matched landmark of each feature, -1 for none, int64, shape :math:`(N,)`.
+            landmarks: Id of the matched landmark of each feature, -1 for none, int64, shape :math:`(N,)`.
         """
         observed = contains(keyframe.observed_landmarks.numpy(), landmarks.numpy(), len(self.landmarks))
         matched = (landmarks >= 0) & ~torch.from_numpy(observed)
@@ -221,7 +221,7 @@ class SparseMap(MapTables):
             self.keyframes[index].landmarks[features[keyframes == index]] = -1
 
     def _add_observations(self, keyframe: Keyframe, indices: Tensor, landmarks: Tensor) -> None:
-        """Add observations by some features of a keyframe, given the landmark IDs of all its features."""
+        """Add observations by some features of a keyframe, given the landmark ids of all its features."""
         if len(indices) == 0:
             return
         features = keyframe.features

@@ -41,7 +41,7 @@ def propagate_instances(
         config: Spacing and maximum depth of the points of the tracks.
 
     Returns:
-        Instances with the IDs and classes of the tracks, score 0 and empty boxes.
+        Instances with the ids and classes of the tracks, score 0 and empty boxes.
     """
     detected = [track for track in tracks if not track.missed and track.label != UNLABELLED]
     projected = silhouettes(predict_clouds(detected, view.stamp, view.T_dw), camera, config.voxel_size)

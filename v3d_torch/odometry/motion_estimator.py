@@ -80,14 +80,14 @@ class RelativeMotion:
         return distance <= max_speed * elapsed and angle <= _MAX_ROTATION_RATE * elapsed
 
     def propagate_landmarks(self, landmarks: Tensor, count: int) -> Tensor:
-        """Landmark IDs of the features of b, propagated from a by the inlier matches.
+        """Landmark ids of the features of b, propagated from a by the inlier matches.
 
         Args:
-            landmarks: Landmark ID of each feature of a, int64, shape :math:`(N,)`; -1 = none.
+            landmarks: Landmark id of each feature of a, int64, shape :math:`(N,)`; -1 = none.
             count: Number of features of b.
 
         Returns:
-            Landmark ID of each feature of b, int64, shape ``(count,)``; -1 = none.
+            Landmark id of each feature of b, int64, shape ``(count,)``; -1 = none.
         """
         propagated = torch.full((count,), -1, dtype=torch.int64)
         propagated[self.pairs[:, 1]] = landmarks[self.pairs[:, 0]]

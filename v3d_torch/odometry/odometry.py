@@ -27,7 +27,7 @@ class TrackedFrame:
         depth: Re-estimated depth, metres, shape :math:`(1, H, W)`.
         features: Features on static pixels; all features while the static pixels are unknown.
         static_mask: Mask of the static pixels, bool, shape :math:`(H, W)`; None while unknown.
-        landmarks: Landmark ID of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
+        landmarks: Landmark id of each feature, int64, shape :math:`(N,)`, -1 = none; None while unknown.
     """
 
     frame: RGBDFrame
@@ -83,14 +83,14 @@ class CameraMotion:
         return residuals
 
     def propagate_landmarks(self, previous: TrackedFrame | None, count: int) -> Tensor:
-        """Landmark IDs of the features of the current frame, propagated by the inlier matches.
+        """Landmark ids of the features of the current frame, propagated by the inlier matches.
 
         Args:
             previous: Previous frame; None if there is none.
             count: Number of features of the current frame.
 
         Returns:
-            Landmark ID of each feature, int64, shape ``(count,)``; -1 = none.
+            Landmark id of each feature, int64, shape ``(count,)``; -1 = none.
         """
         if previous is None or previous.landmarks is None:
             return torch.full((count,), -1, dtype=torch.int64)

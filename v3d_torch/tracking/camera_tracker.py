@@ -62,7 +62,7 @@ class CameraTracker:
             features: Static features of the frame.
             depth: Depth of the frame, metres, shape :math:`(1, H, W)`, 0 = no measurement.
             T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
-            landmarks: Landmark ID of each feature as matched from the previous frame, -1 for none, int64, shape
+            landmarks: Landmark id of each feature as matched from the previous frame, -1 for none, int64, shape
                 :math:`(N,)`.
             motion: Motion of the camera since the previous frame.
             poses: Poses of all earlier frames.

@@ -30,8 +30,8 @@ class MapTracking:
 
     Attributes:
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
-        landmarks: Landmark ID of each feature, -1 for none, int64, shape :math:`(N,)`.
-        visible: IDs of the landmarks that the frame should have observed, int64, shape :math:`(V,)`.
+        landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
+        visible: Ids of the landmarks that the frame should have observed, int64, shape :math:`(V,)`.
         information: Information matrix of the left perturbation of ``T_cw``, float64, shape :math:`(6, 6)`.
     """
 
@@ -42,7 +42,7 @@ class MapTracking:
 
     @property
     def observed_landmarks(self) -> Tensor:
-        """IDs of the landmarks that were found, int64, shape :math:`(F,)`."""
+        """Ids of the landmarks that were found, int64, shape :math:`(F,)`."""
         return self.landmarks[self.landmarks >= 0]
 
     @property
@@ -75,7 +75,7 @@ class MapTracker:
             features: Static features of the frame.
             T_cw: Predicted world-to-camera pose, float64, shape :math:`(4, 4)`.
             local_map: Landmarks near the prediction.
-            landmarks: Landmark ID of each feature as matched from the previous frame, -1 for none, int64, shape
+            landmarks: Landmark id of each feature as matched from the previous frame, -1 for none, int64, shape
                 :math:`(N,)`.
             depth: Depth of the frame, metres, shape :math:`(1, H, W)`, 0 = no measurement. Landmarks behind it are
                 occluded, mostly by people, and do not count as visible. None if it is not known.

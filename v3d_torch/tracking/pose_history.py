@@ -22,7 +22,7 @@ class PoseHistory:
 
     Attributes:
         last_found: Time of the last frame that was found, seconds; minus infinity if there is none.
-        observed_landmarks: IDs of the landmarks of the last frame that observed landmarks, int64, shape :math:`(L,)`.
+        observed_landmarks: Ids of the landmarks of the last frame that observed landmarks, int64, shape :math:`(L,)`.
     """
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class PoseHistory:
 
     @property
     def part(self) -> int:
-        """ID of the part of the map in which the camera was last found, see `Keyframe`; 0 if it was not found."""
+        """Id of the part of the map in which the camera was last found, see `Keyframe`; 0 if it was not found."""
         return 0 if self._place is None else self._place.part
 
     @property
