@@ -34,7 +34,7 @@ from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.cli.batch import app
 from v3d_torch.config.loading import load_config
 from v3d_torch.runs.result_folder import lock_results
-from v3d_torch.runtime.hangup import HANGUP
+from v3d_torch.runtime.hangup import handled_hangup
 
 BROKEN_AT = 3
 """Index of the damaged image."""
@@ -362,7 +362,7 @@ def interrupt(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to other processes")
-@pytest.mark.parametrize("number", [signal.SIGINT, *HANGUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, *handled_hangup()])
 def test_signal_of_a_terminal_keeps_partial_results_and_resume_finishes(
     number: signal.Signals, moment: Path, tmp_path: Path
 ) -> None:

@@ -25,7 +25,7 @@ from v3d_torch.cli.record import app
 from v3d_torch.cli.record_command import record_all
 from v3d_torch.datasets import RGBDSequence, load_sequence, tum_writer
 from v3d_torch.io.files import write_png
-from v3d_torch.runtime.hangup import HANGUP
+from v3d_torch.runtime.hangup import handled_hangup
 from v3d_torch.types import Instances, RGBDFrame
 
 K = [30.0, 0, 15.5, 0, 31.25, 11.5, 0, 0, 1]
@@ -92,7 +92,7 @@ def test_damaged_ground_truth_keeps_all_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no SIGINT to another process")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, *HANGUP])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, *handled_hangup()])
 def test_signal_leaves_complete_folder(number: signal.Signals, tmp_path: Path) -> None:
     folder, out = tmp_path / "long", tmp_path / "out"
     save(folder / "rgb.png", colour_of(0, 640, 480))
