@@ -220,7 +220,8 @@ class InstanceTracker(torch.nn.Module):
         """
         if len(detected) == len(matched):
             return {}
-        without_masks = [*self.resting, *self.lost]
+        labels = set(detected.labels.tolist())  # an instance continues a track without a mask only if it has its class
+        without_masks = [track for track in (*self.resting, *self.lost) if track.label in labels]
         tracks = [*predicted.tracks, *without_masks]
         evidence = torch.cat(
             [
