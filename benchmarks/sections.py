@@ -12,7 +12,7 @@ from tables import (
     VARIANTS,
     accuracy_table,
     bullets,
-    design_table,
+    design_tables,
     flat,
     network_tables,
     notes,
@@ -90,7 +90,7 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 " it is not deterministic. A system that skips hard frames has a lower error, so coverage is given if"
                 " it is below 100%. Parameters of v3d_torch were chosen on these sequences, those of the other"
                 " systems are their defaults. Results on the same sequences played backwards, mirrored, or with"
-                " changed images, on which no parameter was chosen, are among the [design choices](#design-choices)."
+                " changed images are below ([design choices](#sequences-on-which-no-parameter-was-chosen))."
             ),
             accuracy_table,
             key="system",
@@ -384,11 +384,11 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
         Part(
             "design_choices",
             (
-                "Single measurements that led to a choice. Each compares the choice with its alternative at one"
-                " commit; no script repeats them. If the commit of the measurement is not known, the commit that"
+                "Single measurements that led to a choice, by topic. Each compares the choice with its alternative at"
+                " one commit; no script repeats them. If the commit of the measurement is not known, the commit that"
                 " recorded it is given."
             ),
-            design_table,
+            design_tables,
             remarks=no_remarks,
             shows_provenance=False,
         ),

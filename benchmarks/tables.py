@@ -48,6 +48,21 @@ VARIANTS = {
 }
 """Names of the variants of the ablation study in tables."""
 
+DESIGN_TOPICS = (
+    "Segmentation network",
+    "Masks",
+    "Ids",
+    "Motion of objects",
+    "Positions and velocities of objects",
+    "Tracking and mapping",
+    "Camera model: rolling shutter, depth delay, calibration",
+    "Dense map and occupancy map",
+    "Preset realtime and live",
+    "Speed and memory",
+    "Sequences on which no parameter was chosen",
+)
+"""Topics of the design choices, in the order of their tables."""
+
 
 def accuracy_table(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield a line per sequence: ATE of each system that ran, then of those in ``peers.yaml``."""
@@ -112,22 +127,31 @@ def tracks_table(measurements: Sequence[Measurement]) -> Iterator[str]:
 def network_tables(measurements: Sequence[Measurement]) -> Iterator[str]:
     """Yield a table of segmentation networks per sequence, each under a heading."""
     rows = rows_of(measurements)
-    for number, sequence in enumerate(unique(cells["sequence"] for cells in rows)):
+    tables = {
+        f"{sequence} ({kind(sequence)})": [cells for cells in rows if cells["sequence"] == sequence]
+        for sequence in unique(cells["sequence"] for cells in rows)
+    }
+    yield from _tables_with_headings(tables, columns.SEGMENTATION)
+
+
+def design_tables(measurements: Sequence[Measurement]) -> Iterator[str]:
+    """Yield a table of design choices per topic, each under a heading: a line per measurement, with commit and date."""
+    tables: dict[str, list[Row]] = {topic: [] for topic in DESIGN_TOPICS}
+    for measurement in measurements:
+        for cells in measurement.rows:  # an unknown topic is an error
+            commit = f"{measurement.heading.commit}, {measurement.heading.date}"
+            tables[cells["topic"]].append(cells | {"commit": commit})
+    yield from _tables_with_headings({topic: rows for topic, rows in tables.items() if rows}, columns.DESIGN_CHOICES)
+
+
+def _tables_with_headings(tables: Mapping[str, Sequence[Row]], names: Mapping[str, str]) -> Iterator[str]:
+    """Yield tables with the same columns, each under its heading."""
+    for number, (heading, rows) in enumerate(tables.items()):
         if number:
             yield ""
-        yield f"### {sequence} ({kind(sequence)})"
+        yield f"### {heading}"
         yield ""
-        yield from flat([cells for cells in rows if cells["sequence"] == sequence], columns.SEGMENTATION)
-
-
-def design_table(measurements: Sequence[Measurement]) -> Iterator[str]:
-    """Yield a line per measurement behind a design choice, with the commit and date of each."""
-    rows = [
-        cells | {"commit": f"{measurement.heading.commit}, {measurement.heading.date}"}
-        for measurement in measurements
-        for cells in measurement.rows
-    ]
-    yield from flat(rows, columns.DESIGN_CHOICES)
+        yield from flat(rows, names)
 
 
 def pivot(
