@@ -31,6 +31,7 @@ from helpers.module_cases import (
     tensors,
     without_padding,
 )
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -258,6 +259,15 @@ def test_mask_of_another_type_than_bool_is_rejected(title: str, name: str, dtype
     mask = inputs.get(name, torch.ones(1, dtype=torch.bool)).to(dtype)
     with pytest.raises(v3d.InputError, match=rf"^{name} has the type {dtype}; give a mask of type torch\.bool$"):
         case.function(**inputs | {name: mask})
+
+
+@pytest.mark.parametrize(("title", "name"), MASKS)
+def test_mask_of_another_length_is_rejected(title: str, name: str) -> None:
+    """A mask of length 1 would be applied to all rows."""
+    case = (CASES | FUNCTION_CASES)[title]
+    inputs = case.inputs(2, 12, torch.float32)
+    with pytest.raises(ShapeError):
+        case.function(**inputs | {name: torch.ones(2, 1, dtype=torch.bool)})
 
 
 NUMBERS = [

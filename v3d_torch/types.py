@@ -272,7 +272,7 @@ class Trajectory:
         T_wc: Camera-to-world poses, float64, shape :math:`(N, 4, 4)`.
 
     Raises:
-        InputError: If the values are not numbers of these shapes, or the stamps do not increase.
+        InputError: If the values are not numbers of these shapes, or the stamps are not finite or do not increase.
     """
 
     stamps: Tensor
@@ -300,6 +300,8 @@ class Trajectory:
                 f"stamps of a trajectory do not increase ({after:.6f} s follows {before:.6f} s); sort the poses by"
                 " time, and give each time once and in float64"
             )
+        if not bool(self.stamps.isfinite().all()):
+            raise InputError("stamps of a trajectory have a value that is not finite; give seconds, or remove the pose")
 
     def __len__(self) -> int:
         return self.stamps.shape[0]

@@ -136,6 +136,13 @@ def test_empty_trajectory_is_written_as_empty_file(tmp_path: Path) -> None:
     assert (tmp_path / "trajectory.txt").read_bytes() == b""
 
 
+def test_each_line_of_a_comment_is_a_comment(tmp_path: Path) -> None:
+    trajectory = random_trajectory(2, seed=0)
+    write_trajectory(tmp_path / "trajectory.txt", trajectory, comment="room 5\n9 0 0 0 0 0 0 1\r\n\nsecond run")
+    assert (tmp_path / "trajectory.txt").read_text().startswith("# room 5\n# 9 0 0 0 0 0 0 1\n# \n# second run\n")
+    assert len(read_trajectory(tmp_path / "trajectory.txt")) == 2
+
+
 def test_unwritable_file_raises_output_error(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").mkdir()
     with pytest.raises(OutputError, match=r"trajectory\.txt"):
@@ -168,6 +175,8 @@ def test_trajectory_is_created_from_arrays_and_lists(tmp_path: Path) -> None:
         (None, None, "stamps of a trajectory"),
         ([1, 3, 2.5, 2], np.zeros((4, 4, 4)), r"stamps .* do not increase \(2.500000 s follows 3.000000 s\); sort the"),
         ([1, 1], np.zeros((2, 4, 4)), r"stamps .* do not increase \(1.000000 s follows 1.000000 s\); sort the poses"),
+        ([np.nan], np.zeros((1, 4, 4)), "stamps of a trajectory have a value that is not finite; give seconds"),
+        ([1, np.inf], np.zeros((2, 4, 4)), "stamps of a trajectory have a value that is not finite; give seconds"),
         ([1, np.nan], np.zeros((2, 4, 4)), r"stamps of a trajectory do not increase \(nan s follows 1.000000 s\)"),
     ],
 )

@@ -7,6 +7,7 @@ import torch
 from helpers.box_room import CAMERA
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.camera import back_project
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.normals import surface_normals
@@ -81,3 +82,9 @@ def test_normals_of_a_wall_with_kinect_noise_are_accurate(distance: float, degre
     angle = torch.rad2deg(torch.arccos((normals[valid] @ n).clamp(max=1)))
     assert angle.quantile(0.9) < degrees
     assert valid.double().mean() > 0.95
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_negative_radius_is_rejected(dtype: torch.dtype) -> None:
+    with pytest.raises(ConfigError, match=r"^radius is -1; give a number of pixels of at least 0$"):
+        surface_normals(torch.ones(1, 9, 9, 3, dtype=dtype), radius=-1)

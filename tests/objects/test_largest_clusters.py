@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from v3d_torch.errors import InputError
 from v3d_torch.objects.largest_clusters import largest_clusters
 
 
@@ -44,3 +46,10 @@ def test_empty_clouds_have_no_clusters() -> None:
     for shape in [(0, 3), (2, 0)]:
         selected = largest_clusters(torch.zeros(shape, dtype=torch.int64), torch.zeros(shape, dtype=torch.bool))
         assert selected.shape == shape and selected.dtype == torch.bool
+
+
+@pytest.mark.parametrize("dtype", [torch.int32, torch.float32])
+def test_labels_of_another_type_are_rejected(dtype: torch.dtype) -> None:
+    labels, valid = torch.zeros(1, 3, dtype=dtype), torch.ones(1, 3, dtype=torch.bool)
+    with pytest.raises(InputError, match=rf"^labels has the type {dtype}; give labels of type torch\.int64$"):
+        largest_clusters(labels, valid)

@@ -190,6 +190,24 @@ def test_ball_in_a_free_ball_is_free(
     assert not occupancy.is_free(points, large).item() or occupancy.is_free(points, small).item()
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -1e12])
+@pytest.mark.parametrize("column", [0, 3])
+def test_pose_that_is_not_rigid_or_very_far_away_is_an_input_error(column: int, value: float) -> None:
+    """A map with voxels at such a place could not be loaded, and the compiled ray casting ended the process."""
+    occupancy = map_of(box_of_voxels((0, 0, 0), (1, 1, 1)), box_of_voxels((1, 0, 0), (2, 1, 1)))
+    T_wc = EYE.clone()
+    T_wc[0, column] = value
+    before = occupancy.occupied_points
+    with pytest.raises(InputError, match=r"^the pose T_wc of a depth image is .*; give a rigid transform, at most"):
+        occupancy.integrate(torch.ones(2, 3), torch.ones(2, 3, dtype=torch.bool), CAMERA.rays[:2, :3], T_wc)
+    assert torch.equal(occupancy.occupied_points, before)
+
+
+def test_mask_of_static_pixels_of_another_type_is_rejected() -> None:
+    with pytest.raises(InputError, match=r"^static has the type torch\.uint8; give a mask of type torch\.bool$"):
+        OccupancyMap(CONFIG).integrate(torch.ones(2, 3), torch.ones(2, 3).to(torch.uint8), CAMERA.rays[:2, :3], EYE)
+
+
 @pytest.mark.parametrize("radius", [-0.1, torch.nan, torch.inf])
 def test_radius_that_is_negative_or_not_finite_is_an_input_error(radius: float, room: OccupancyMap) -> None:
     with pytest.raises(InputError, match=rf"the radius of balls is {radius} m; give a finite radius of at least 0"):

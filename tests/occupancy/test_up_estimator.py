@@ -9,9 +9,11 @@ import pytest
 import torch
 from helpers.differences import differences
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.occupancy.floor import Floor
+from v3d_torch.occupancy.up_direction import estimate_up
 from v3d_torch.occupancy.up_estimator import UpEstimator
 
 T_CW = se3_exp(torch.tensor([0.1, -0.2, 0.3, 0.2, 0.1, -0.4], dtype=torch.float64))
@@ -72,3 +74,9 @@ def test_state_is_restored() -> None:
     for each in (estimator, restored):
         each.add_gravity(DOWN, torch.eye(4, dtype=torch.float64), T_CW)
     assert torch.equal(restored.up(FLOOR), estimator.up(FLOOR)) and not torch.equal(restored.up(FLOOR), FLOOR.up)
+
+
+@pytest.mark.parametrize("gravity", [[0.0, 0.0, 0.0], [0.0, math.nan, 1.0], [0.0, math.inf, 1.0], [0.0, 1.0]])
+def test_gravity_without_direction_is_an_input_error(gravity: list[float]) -> None:
+    with pytest.raises(InputError, match=r"^gravity is \[.*\]; give a vector of 3 numbers, not zero$"):
+        estimate_up(torch.tensor(gravity))

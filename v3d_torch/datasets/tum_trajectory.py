@@ -75,7 +75,7 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
     Args:
         path: Path of the file; missing folders are created.
         trajectory: Camera-to-world poses; an empty trajectory creates a file without poses.
-        comment: Comment for the first line; None for no comment.
+        comment: Comment for the first line, or lines; None for no comment.
 
     Raises:
         InputError: If ``trajectory`` is not a `Trajectory`, or one of its poses is not a rigid transform.
@@ -89,7 +89,7 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
     is_rigid = are_rigid(trajectory.T_wc.detach(), ROTATION_TOLERANCE).numpy()
     if not is_rigid.all():
         raise InputError(f"{path}: pose {is_rigid.argmin()} is not a valid rigid transform; repair or remove it")
-    lines = [] if comment is None else [f"# {comment}\n"]
+    lines = [] if comment is None else ["# " + "\n# ".join(comment.splitlines()) + "\n"]
     if len(trajectory):
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
         poses = np.concatenate([T_wc[:, :3, 3], quaternions], axis=1).round(9) + 0.0  # + 0.0: no "-0.000000000"

@@ -86,6 +86,8 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
     check_masks(valid=valid)
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
+    if valid is not None:
+        KORNIA_CHECK_SHAPE(valid, ["*", str(T_gc.shape[-3])])
     each = None if valid is None else valid[..., None, None]
     truth, estimate = fill_padding(T_gc, each, 0.0), fill_padding(T_ec, each, 0.0)
     errors = absolute_errors(truth, estimate, align(truth, estimate, valid))

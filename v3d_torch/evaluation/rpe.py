@@ -83,6 +83,8 @@ def rpe(
     KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
     KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
     KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
+    if valid is not None:
+        KORNIA_CHECK_SHAPE(valid, ["*", str(T_gc.shape[-3])])
     exists = mask_or_all(valid, stamps)
     batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1], exists.shape[:-1])
     exists = exists.expand(*batch, -1)

@@ -88,6 +88,9 @@ def essential_ransac(
     KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
     KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    for each in (weights, valid):
+        if each is not None:
+            KORNIA_CHECK_SHAPE(each, ["*", str(uv_a.shape[-2])])
     valid = mask_or_all(valid, uv_a[..., 0]) & uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
     if weights is None:
         weights = torch.ones_like(uv_a[..., 0])

@@ -60,6 +60,8 @@ def _match_descriptors_compiled(
     masks = [valid for valid in (a_valid, b_valid) if valid is not None]
     if any(valid.dtype != torch.bool for valid in masks):
         return NotImplemented
+    if any(v is not None and v.shape[-1:] != each.shape[-2:-1] for each, v in ((a, a_valid), (b, b_valid))):
+        return NotImplemented
     batch = common_batch(*(each.shape[:-2] for each in (a, b)), *(valid.shape[:-1] for valid in masks))
     a, b = (each.expand(*batch, *each.shape[-2:]) for each in (a, b))
     matches = torch.full(a.shape[:-1], -1)
@@ -116,6 +118,9 @@ def match_descriptors(
             raise InputError(f"{name} has the type {descriptors.dtype}; give binary descriptors of type torch.uint8")
     KORNIA_CHECK_SHAPE(a, ["*", "N", "D"])
     KORNIA_CHECK_SHAPE(b, ["*", "M", str(a.shape[-1])])
+    for descriptors, valid in ((a, a_valid), (b, b_valid)):
+        if valid is not None:
+            KORNIA_CHECK_SHAPE(valid, ["*", str(descriptors.shape[-2])])
     distance = _pairwise_hamming_distances(a, b)
     a_valid = distance.new_ones(a.shape[-2], dtype=torch.bool) if a_valid is None else a_valid
     b_valid = distance.new_ones(b.shape[-2], dtype=torch.bool) if b_valid is None else b_valid

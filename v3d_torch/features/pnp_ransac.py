@@ -86,6 +86,8 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
     KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
+    if valid is not None:
+        KORNIA_CHECK_SHAPE(valid, ["*", str(points.shape[-2])])
     present = mask_or_all(valid, uv[..., 0]) & points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)
     if initial_guess is not None:
         KORNIA_CHECK_SHAPE(initial_guess, ["*", "4", "4"])

@@ -10,6 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import pad
 
+from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import normals as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -20,7 +21,7 @@ _EDGE_RATIO = 0.05
 
 
 def _surface_normals_compiled(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _EDGE_RATIO) -> Tensor:
-    if points.dtype != torch.float32 or points.ndim != 4 or points.shape[3] != 3:
+    if points.dtype != torch.float32 or points.ndim != 4 or points.shape[3] != 3 or radius < 0:
         return NotImplemented
     normals = torch.zeros(points.shape, dtype=points.dtype)  # contiguous, even if the points are not
     for image, result in zip(to_array(points), normals.numpy(), strict=True):
@@ -45,7 +46,12 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     Returns:
         Unit normals towards the camera, shape and dtype of ``points``, float32 for integers; (0, 0, 0) unless the pixel
         and its four neighbours are measured and lie on one surface.
+
+    Raises:
+        ConfigError: If ``radius`` is negative.
     """
+    if radius < 0:
+        raise ConfigError(f"radius is {radius}; give a number of pixels of at least 0")
     KORNIA_CHECK_SHAPE(points, ["B", "H", "W", "3"])
     dtype, points = result_dtype(points.dtype), points.to(working_dtype(points.dtype))
     z = points[..., 2]

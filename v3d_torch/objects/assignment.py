@@ -34,8 +34,10 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
     KORNIA_CHECK_SHAPE(log_ratio, ["B", "T", "N"])
     gain = log_ratio.detach().to(torch.float64).clamp(min=0)
     if tracked is not None:
+        KORNIA_CHECK_SHAPE(tracked, [str(size) for size in gain.shape[:2]])
         gain = torch.where(tracked[..., :, None], gain, 0.0)
     if present is not None:
+        KORNIA_CHECK_SHAPE(present, [str(size) for size in gain.shape[::2]])
         gain = torch.where(present[..., None, :], gain, 0.0)
     return _assign(gain) if can_read(gain) else _assign_on_host(gain)
 

@@ -6,6 +6,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.kernels.compiler import can_read
 
@@ -27,9 +28,11 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
         Mask of the points of the selected clusters, bool, shape :math:`(B, N)`.
 
     Raises:
-        InputError: If ``valid`` is not bool.
+        InputError: If ``valid`` is not bool, or ``labels`` are not int64.
     """
     check_masks(valid=valid)
+    if labels.dtype != torch.int64:
+        raise InputError(f"labels has the type {labels.dtype}; give labels of type torch.int64")
     KORNIA_CHECK_SHAPE(labels, ["B", "N"])
     KORNIA_CHECK_SHAPE(valid, [str(size) for size in labels.shape])
     if labels.numel() == 0:

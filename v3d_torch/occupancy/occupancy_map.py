@@ -14,6 +14,9 @@ from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.cell_keys import MAX_COORDINATE
+from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.kernels.voxel_blocks import SIDE, UNKNOWN
 from v3d_torch.occupancy.clearance import NearestVoxels, are_balls_free, cube_gap
 from v3d_torch.occupancy.ray_casting import observe_voxels
@@ -21,6 +24,12 @@ from v3d_torch.occupancy.sensor_model import SensorModel
 from v3d_torch.occupancy.voxel_blocks import VoxelBlocks
 
 _LOG = logging.getLogger(__name__)
+
+_MAX_CAMERA_BLOCKS = MAX_COORDINATE // 2
+"""Largest coordinate of a camera, blocks: the coordinates of all observed blocks then have keys."""
+
+_ROTATION_TOLERANCE = 0.01
+"""Maximum difference between an element of R R^T and of the identity, as for trajectory files."""
 
 _KEPT_FRACTION = 0.9
 """Fraction of the maximum number of blocks that is kept when blocks are removed, so that removal is rare."""
@@ -94,8 +103,19 @@ class OccupancyMap:
                 that the space in front of them is free.
             rays: Viewing ray of each pixel at unit depth, float32, shape :math:`(h, w, 3)`; see `PinholeCamera.rays`.
             T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
+
+        Raises:
+            InputError: If ``static`` is not bool, or the pose is not a rigid transform or too far from the origin.
         """
+        check_masks(static=static)
+        KORNIA_CHECK_SHAPE(T_wc, ["4", "4"])
         config = self.config
+        limit = _MAX_CAMERA_BLOCKS * SIDE * config.voxel_size
+        if not bool(are_rigid(T_wc, _ROTATION_TOLERANCE)) or float(T_wc[:3, 3].abs().max()) > limit:
+            raise InputError(
+                f"the pose T_wc of a depth image is {T_wc.tolist()}; give a rigid transform, at most {limit:.0f} m from"
+                " the origin"
+            )
         limits = config.voxel_size, config.max_depth, config.depth_tolerance
         self.blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self.sensor_model)
         if len(self.blocks) > config.max_blocks:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from v3d_torch.errors import InputError
+
 _GRAVITY_TOLERANCE = math.radians(5)
 """Error of an accelerometer's up direction: bias and acceleration of a camera that is moved by hand."""
 
@@ -42,8 +44,13 @@ def estimate_up(gravity: Tensor | None = None, votes: Tensor | None = None) -> U
 
     Returns:
         Up direction with a bound of its error; that of the first image if neither source is available.
+
+    Raises:
+        InputError: If the gravity is not a vector of 3 finite numbers, or zero.
     """
     if gravity is not None:
+        if gravity.shape != (3,) or not 0 < float(gravity.to(torch.float64).norm()) < math.inf:
+            raise InputError(f"gravity is {gravity.tolist()}; give a vector of 3 numbers, not zero")
         return UpDirection(-normalize(gravity.to(torch.float64), dim=0), _GRAVITY_TOLERANCE)
     if votes is not None and float(votes.norm()) >= _MIN_VOTES:
         return UpDirection(normalize(votes.to(torch.float64), dim=0), _IMAGE_TOLERANCE)
