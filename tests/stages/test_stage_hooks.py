@@ -221,3 +221,12 @@ def test_hooks_see_a_wrapper_of_a_hooked_stage_once(system: type[V3DSLAM]) -> No
         setattr(slam, name, partial(getattr(slam, name)))
     slam(walk[0])
     assert [seen.count(name) for name in ("segment", "smooth_depth")] == [1, 1]
+
+
+def test_appearance_that_is_not_compared_is_not_computed() -> None:
+    tracker = SERIAL.objects.tracker.model_copy(update={"compare_appearance": False})
+    config = SERIAL.model_copy(update={"objects": SERIAL.objects.model_copy(update={"tracker": tracker})})
+    slam, seen = V3DSLAM(CAMERA, segment_red, config), []
+    slam.register_stage_hook(None, lambda name, *_: seen.append(name))
+    slam(Walk()[0])
+    assert "describe_appearance" not in seen and "classify_motion" in seen
