@@ -303,8 +303,9 @@ class V3DSLAM(FramePreprocessor):
             instances = self._complete_instances(segmentation.instances, view, newly_occupied)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
-            is_propagated = instances.track_ids is not None  # their ids are known without a comparison
-            appearance = None if is_propagated else self.describe_appearance(frame.image, clouds.cloud_pixels)
+            # The ids of propagated instances are known without a comparison.
+            is_compared = self.config.objects.tracker.compare_appearance and instances.track_ids is None
+            appearance = self.describe_appearance(frame.image, clouds.cloud_pixels) if is_compared else None
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             residuals = motion.residuals(self._previous, features, self.camera)
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)), residuals)

@@ -92,6 +92,26 @@ def test_failure_of_a_stage_is_named_and_the_log_has_its_traceback(
     assert "return 1 / 0" in (tmp_path / "out" / "run.log").read_text()
 
 
+def test_stage_that_exits_ends_the_run_with_the_results_so_far(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "leaving.py").write_text(
+        "from v3d_torch.geometry.depth_smoother import DepthSmoother\n"
+        "class Leave(DepthSmoother):\n"
+        "    calls = 0\n"
+        "    def __init__(self, config, camera): super().__init__(5, 1.0, 0.05)\n"
+        "    def forward(self, depth):\n"
+        "        self.calls += 1\n"
+        "        if self.calls == 3: raise SystemExit\n"
+        "        return super().forward(depth)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    stage, out = "stages.smooth_depth=leaving:Leave", tmp_path / "out"
+    done = call_here("--seq", sequence, "--out", out, "--segmenter", "none", "--set", stage, cwd=tmp_path)
+    assert_error_line(done, f"error: {stage} failed with SystemExit (the results of the 2 frames before are in")
+    assert (out / "metrics.json").is_file()
+
+
 def test_configuration_file_gives_the_same_results(sequence: Path, own: Path, tmp_path: Path) -> None:
     (tmp_path / "lab.yaml").write_text(f"stages:\n  segment: {MODULE}:Corner\n")
     for name, option in (("a", ("--set", SEGMENT)), ("b", ("--config", tmp_path / "lab.yaml"))):

@@ -12,7 +12,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from helpers.trajectories import assert_statistics, noisy, random_walk
 from torch import Tensor
 
-from v3d_torch.errors import ConfigError
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.evaluation.association import associate_trajectories
 from v3d_torch.evaluation.rpe import motion_errors, pairs_apart, relative_errors, relative_pose_error, rpe
@@ -160,6 +160,17 @@ def test_time_between_poses_that_is_not_positive_is_an_error(delta: float) -> No
         rpe(truth.T_wc, truth.T_wc, truth.stamps, delta=delta)
     with pytest.raises(ConfigError, match=r"delta is .*; give a number above 0"):
         evaluate(truth, truth, rpe_delta=delta)
+
+
+def test_stamps_that_do_not_increase_are_an_error() -> None:
+    truth = random_walk(8, seed=42)
+    unix, valid = (1.3e9 + truth.stamps).to(torch.float32), torch.ones(8, dtype=torch.bool)
+    for wrong in (unix, truth.stamps.flip(0), truth.stamps.clone().index_fill_(0, torch.tensor([3]), torch.nan)):
+        with pytest.raises(InputError, match=r"^stamps do not increase; .* in float64"):
+            rpe(truth.T_wc, truth.T_wc, wrong)
+    stamps, valid[3] = truth.stamps.clone(), False
+    stamps[3] = -1.0  # padding
+    rpe(truth.T_wc, truth.T_wc, stamps, valid)
 
 
 def test_stamps_too_large_for_the_time_between_poses_give_no_pairs() -> None:

@@ -223,6 +223,24 @@ def test_wrong_number_of_values_is_rejected(name: str, size: int) -> None:
         refine_pose(torch.eye(4), points, points[:, :2], CAMERA.K, **{name: wrong})
 
 
+@pytest.mark.parametrize("name", ["pixel_sigma", "inverse_depth_sigma"])
+@pytest.mark.parametrize("shape", [(5,), (8, 1), (8, 8, 1)])
+def test_standard_deviations_that_are_not_one_for_each_measurement_are_rejected(name: str, shape: list[int]) -> None:
+    points = torch.ones(8, 3)
+    with pytest.raises(ShapeError):
+        refine_pose(torch.eye(4), points, points[:, :2], CAMERA.K, **{name: torch.ones(shape)})
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 1)])
+def test_tensor_with_one_standard_deviation_counts_as_a_number(shape: list[int]) -> None:
+    start, points, measured, _ = measure_landmarks(8)
+    given = vars(measured) | {"pixel_sigma": 2.0}
+    expected = refine_pose(start, points, K=CAMERA.K, **given)
+    given["pixel_sigma"] = torch.full(shape, 2.0)
+    found = refine_pose(start, points, K=CAMERA.K, **given)
+    torch.testing.assert_close(found.T_cw.reshape(4, 4), expected.T_cw, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("value", [-1.0, torch.nan])
 def test_weight_that_is_negative_or_nan_is_an_error(value: float) -> None:
     _, points, measured, _ = measure_landmarks(8)

@@ -37,6 +37,11 @@ class OfTheInput:
         raise InputError("x.onnx: is missing; download it")
 
 
+class Exit:
+    def __init__(self, config, camera):
+        raise SystemExit(2)
+
+
 class WhenCalled:
     def __init__(self, config, camera):
         pass
@@ -44,6 +49,8 @@ class WhenCalled:
     def __call__(self, number):
         if number < 0:
             raise InputError("no image")
+        if number > 9:
+            raise SystemExit(number)
         return 1 / number
 
     method = __call__
@@ -55,10 +62,11 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     folder = write_own_stages(tmp_path)
     (folder / "broken_stages.py").write_text("import a_package_that_is_missing\n")
     (folder / "wrong_stages.py").write_text("raise ValueError('two\\nlines')\n")
+    (folder / "leaving_stages.py").write_text("raise SystemExit\n")
     (folder / "raising_stages.py").write_text(RAISING)
     monkeypatch.syspath_prepend(folder)
     yield folder
-    for name in (MODULE, "broken_stages", "wrong_stages", "raising_stages"):
+    for name in (MODULE, "broken_stages", "wrong_stages", "leaving_stages", "raising_stages"):
         sys.modules.pop(name, None)
 
 
@@ -81,12 +89,14 @@ def test_class_gets_configuration_and_camera(own: Path) -> None:
         (".relative:Stage", "the module .relative cannot be imported (TypeError: "),
         ("broken_stages:Stage", "(ModuleNotFoundError: No module named 'a_package_that_is_missing'); correct it, ins"),
         ("wrong_stages:Stage", "the module wrong_stages cannot be imported (ValueError: two lines); correct it, inst"),
+        ("leaving_stages:Stage", "the module leaving_stages cannot be imported (SystemExit); correct it, inst"),
         (f"{MODULE}:Missing", f"{MODULE} has no attribute Missing; correct the name after the colon"),
         (f"{MODULE}:Corner:Same", "has no attribute Corner:Same"),
         (f"{MODULE}:number", "is a int, which cannot be called; name a class, or a function that returns the stage"),
         (f"{MODULE}:one_argument", "does not accept two arguments, config and camera (too many positional arguments)"),
         ("raising_stages:AtStart", "cannot be made (RuntimeError: no licence); correct it"),
         ("raising_stages:WithoutMessage", "cannot be made (AssertionError); correct it"),
+        ("raising_stages:Exit", "cannot be made (SystemExit: 2); correct it"),
         ("raising_stages:OfTheInput", "cannot be made (x.onnx: is missing; download it); correct it"),
         (f"{MODULE}:nothing", "returned a NoneType, which cannot be called; return the stage"),
     ],
@@ -107,6 +117,8 @@ def test_error_of_a_stage_names_the_stage(own: Path) -> None:
             "stages.segment=raising_stages:WhenCalled failed with ZeroDivisionError: division by zero"
         )
         assert isinstance(caught.value.__cause__, ZeroDivisionError)
+    with pytest.raises(StageError, match=r"^stages.segment=raising_stages:WhenCalled failed with SystemExit: 10$"):
+        stage(10)
     assert stage(2) == stage.method(2) == 0.5
     with pytest.raises(InputError, match=r"^no image$"):
         stage(-1)

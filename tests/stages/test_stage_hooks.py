@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -210,3 +211,22 @@ def test_stage_of_another_system_has_only_the_hooks_of_its_system(stage: str) ->
     assert called == ["first"]
     V3DSLAM(CAMERA, first.segment, CONFIG)(walk[0])
     assert called == ["first"]
+
+
+@pytest.mark.parametrize("system", [V3DSLAM, CheckedSLAM])
+def test_hooks_see_a_wrapper_of_a_hooked_stage_once(system: type[V3DSLAM]) -> None:
+    slam, walk, seen = make_slam(system), Walk(), []
+    slam.register_stage_hook(None, lambda name, args, _: seen.append(name))
+    for name in ("segment", "smooth_depth"):
+        setattr(slam, name, partial(getattr(slam, name)))
+    slam(walk[0])
+    assert [seen.count(name) for name in ("segment", "smooth_depth")] == [1, 1]
+
+
+def test_appearance_that_is_not_compared_is_not_computed() -> None:
+    tracker = SERIAL.objects.tracker.model_copy(update={"compare_appearance": False})
+    config = SERIAL.model_copy(update={"objects": SERIAL.objects.model_copy(update={"tracker": tracker})})
+    slam, seen = V3DSLAM(CAMERA, segment_red, config), []
+    slam.register_stage_hook(None, lambda name, *_: seen.append(name))
+    slam(Walk()[0])
+    assert "describe_appearance" not in seen and "classify_motion" in seen

@@ -74,7 +74,7 @@ class CloudConfig(Section):
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points, metres: two standard deviations of the depth of a Kinect are 0.1 m there, as large as
     the motion to detect."""
-    voxel_size: float = Field(0.02, ge=0.001)
+    voxel_size: float = Field(0.02, ge=0.001, allow_inf_nan=False)
     """Side of a voxel, metres (authors' code)."""
     eps: float = Field(0.08, gt=0)
     """Radius of DBSCAN, metres: four voxels bridge the depth steps of a Kinect at 4 m, but not a person and the wall
@@ -384,9 +384,9 @@ class MeshConfig(Section):
 
     enabled: bool = False
     """True to write a mesh."""
-    voxel_size: float = Field(0.02, ge=0.005)
+    voxel_size: float = Field(0.02, ge=0.005, allow_inf_nan=False)
     """Side of a voxel, metres: the pixels used lie 1.5 cm apart at 4 m, where the depth error is 2 cm."""
-    truncation: float = Field(0.08, gt=0)
+    truncation: float = Field(0.08, gt=0, allow_inf_nan=False)
     """Truncation distance of the signed distance function, metres: three times the combined error of poses and of
     depth at 4 m."""
 
@@ -398,7 +398,7 @@ class DenseMapConfig(Section):
     """Every n-th row and column of a keyframe is used: points are 8 mm apart at 2 m, less than a voxel."""
     max_depth: float = Field(4.0, gt=0)
     """Maximum depth of points, metres; the noise of farther points would blur the map."""
-    voxel_size: float = Field(0.01, ge=0.001)
+    voxel_size: float = Field(0.01, ge=0.001, allow_inf_nan=False)
     """Side of a voxel, metres: nearly twice the standard deviation of the depth of a Kinect at 2 m."""
     mesh: MeshConfig = MeshConfig()
 
@@ -408,7 +408,7 @@ class OccupancyConfig(Section):
 
     enabled: bool = False
     """True to build an occupancy map and write it."""
-    voxel_size: float = Field(0.05, ge=0.01)
+    voxel_size: float = Field(0.05, ge=0.01, allow_inf_nan=False)
     """Side of a voxel, metres: OctoMap's and ROS's usual resolution in rooms, twice the depth error of a Kinect at
     4 m."""
     interval: int = Field(3, gt=0)

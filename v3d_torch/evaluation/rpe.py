@@ -8,12 +8,14 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.evaluation.association import Matches
 from v3d_torch.evaluation.ate import root_mean_square
 from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.kernels.compiler import can_read
 from v3d_torch.runtime.batches import common_batch, mask_or_all
 from v3d_torch.types import Trajectory
 
@@ -76,7 +78,7 @@ def rpe(
         for integers, shape :math:`(*)` each; NaN if there is no pair.
 
     Raises:
-        InputError: If ``valid`` is not bool.
+        InputError: If ``valid`` is not bool, or the stamps do not increase.
         ConfigError: If ``delta`` is not positive.
     """
     check_masks(valid=valid)
@@ -90,6 +92,7 @@ def rpe(
     exists = exists.expand(*batch, -1)
     order = torch.argsort(~exists, dim=-1, stable=True)  # padding last
     times = torch.where(exists, stamps.to(torch.float64), torch.inf).gather(-1, order)
+    _check_increasing(times)
     second, is_pair = find_later(times, exists.sum(dim=-1), delta)
     identity = torch.eye(4, dtype=torch.float64, device=T_gc.device)
     truth, estimate = (
@@ -98,6 +101,15 @@ def rpe(
     errors = relative_errors(truth, _take_poses(truth, second), estimate, _take_poses(estimate, second))
     trans, rot = (root_mean_square(each, is_pair).to(result_dtype(T_ec.dtype)) for each in errors)
     return trans, rot
+
+
+def _check_increasing(times: Tensor) -> None:
+    """Check that times, with infinite padding at the end, increase, if they can be read at once."""
+    if can_read(times) and not bool(((times[..., 1:] > times[..., :-1]) | times[..., 1:].isinf()).all()):
+        raise InputError(
+            "stamps do not increase; sort the poses by time, and give each time once and in float64, because float32"
+            " rounds Unix times to two minutes"
+        )
 
 
 def relative_pose_error(

@@ -42,9 +42,6 @@ _MAX_VISIBLE_TIME = 0.1
 """A missed object counts as visible for this long, seconds: an object that is missed for longer is mostly hidden or has
 turned, so that its predicted mask is wrong. Tracking still leaves out the pixels of all predicted masks."""
 
-_MAX_VACANT_TIME = 0.5
-"""A missed object whose place was observed to be empty for longer has gone elsewhere and is lost, seconds."""
-
 _MAX_OBSERVED_TIME = 0.2
 """Time before a frame for which the frame shows what was there, seconds: what happened in a longer gap is unknown."""
 
@@ -69,7 +66,7 @@ class InstanceTracker(torch.nn.Module):
     Attributes:
         tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
         resting: Tracks that cannot move by themselves and were missed for at most the maximum time.
-        lost: Confirmed tracks that were missed for longer, or whose place another object or nothing occupies.
+        lost: Confirmed tracks that were missed for longer, or whose place another object occupies.
         comparable_since: Time of the first detection that can be compared with the newest ones, seconds: before it, a
             motion of the camera was not measured.
     """
@@ -293,8 +290,7 @@ class InstanceTracker(torch.nn.Module):
             seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
                 track.add_vacancy(stamp, min(stamp - self._last_stamp, _MAX_OBSERVED_TIME))
-            has_gone = track.vacant_time > _MAX_VACANT_TIME
-            if has_gone or stamp - track.newest.stamp > self._config.max_missed_time or is_covered:
+            if stamp - track.newest.stamp > self._config.max_missed_time or is_covered:
                 lost.append(track)
                 continue
             mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)

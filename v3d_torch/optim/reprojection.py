@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import TrackingConfig
@@ -86,6 +87,10 @@ def prepare_measurements(
         ConfigError: If a standard deviation that is a number is not positive.
     """
     check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
+    for sigma in (pixel_sigma, inverse_depth_sigma):
+        # The shape (M, 1) would broadcast to M problems of a batch, each with one standard deviation.
+        if isinstance(sigma, Tensor) and sigma.numel() != 1:
+            KORNIA_CHECK_SHAPE(sigma, ["*", str(uv.shape[-2])])
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
     inverse_depth = fill_padding(inverse_depth, valid, 0.0)

@@ -37,7 +37,7 @@ def import_stage(name: str, path: str) -> Callable[..., Any]:
         raise ConfigError(f"{key}: is not an import path; write module:attribute, such as my_package:MyStage")
     try:
         module = importlib.import_module(module_name)
-    except Exception as error:  # an import runs any code
+    except (Exception, SystemExit) as error:  # an import runs any code
         raise ConfigError(
             f"{key}: the module {module_name} cannot be imported ({describe_error(error)}); correct it, install it, or"
             " add its folder to PYTHONPATH"
@@ -79,7 +79,7 @@ def make_stage(name: str, path: str, config: Config, camera: PinholeCamera) -> A
         raise ConfigError(f"{key}: does not accept two arguments, config and camera ({error})") from error
     try:
         stage = make(config, camera)
-    except Exception as error:  # a constructor runs any code
+    except (Exception, SystemExit) as error:  # a constructor runs any code
         raise ConfigError(f"{key}: cannot be made ({describe_error(error)}); correct it") from error
     if not callable(stage):
         raise ConfigError(f"{key}: returned {describe_type(stage)}, which cannot be called; return the stage")
@@ -103,7 +103,7 @@ class ImportedStage(StageProxy):
             return self._stage(*args, **kwargs)
         except V3DError:
             raise
-        except Exception as error:  # a stage runs any code
+        except (Exception, SystemExit) as error:  # a stage runs any code; an exit would lose the results so far
             raise StageError(f"{self._name} failed with {describe_error(error)}") from error
 
     def __getattr__(self, name: str) -> Any:

@@ -139,8 +139,11 @@ class ReplaceableStages:
             raise ConfigError(f"{name} is {describe_type(value)}, which cannot be called; set a stage")
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
-        is_hooked = isinstance(vars(self).get(name), HookedStage)
-        super().__setattr__(name, HookedStage(value, name, self._stage_hooks) if is_hooked else value)
+        previous = vars(self).get(name)
+        if isinstance(previous, HookedStage):
+            previous._hooks = {}  # the new stage can be a wrapper that calls it; hooks see the wrapper only
+            value = HookedStage(value, name, self._stage_hooks)
+        super().__setattr__(name, value)
 
     def register_stage_hook(self, name: str | None, hook: StageHook) -> RemovableHandle:
         """Register a function that is called after each call of a stage, as `torch.nn.Module.register_forward_hook`.

@@ -39,7 +39,7 @@ from v3d_torch.cli import record, run
 from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.datasets.realsense import RealSenseCamera, RealSenseStream
-from v3d_torch.datasets.realsense.device import PipelineDevice
+from v3d_torch.datasets.realsense.device import PipelineDevice, open_live_device
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.live import LiveSLAM
@@ -345,6 +345,18 @@ def test_missing_camera_is_an_input_error(name: str, label: str) -> None:
         open_source(name)
     with pytest.raises(InputError, match="is a live camera, which does not support --depth-topic; remove this option"):
         open_source(name, options=SourceOptions(depth_topic="/a"))
+
+
+@pytest.mark.parametrize(("fps", "requested"), [(None, 30), (29.97, 30), (0.4, 1)])
+def test_frame_rate_is_requested(monkeypatch: pytest.MonkeyPatch, fps: float | None, requested: int) -> None:
+    """A rate of 0 would be any rate to librealsense."""
+    library = MagicMock()
+    library.context.return_value.query_devices.return_value = [MagicMock()]
+    library.config.return_value.resolve.side_effect = RuntimeError("Couldn't resolve requests")
+    monkeypatch.setattr("v3d_torch.datasets.realsense.device.import_librealsense", lambda name: library)
+    with pytest.raises(InputError, match=rf"has no colour and depth streams at 640x480 and {requested} Hz; set --fps"):
+        open_live_device("realsense", "", fps)
+    assert [call.args[-1] for call in library.config.return_value.enable_stream.call_args_list] == [requested] * 2
 
 
 def test_missing_pyrealsense2_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -154,7 +154,7 @@ def open_live_device(name: str, serial: str, fps: float | None) -> PipelineDevic
     config = rs.config()
     if serial:
         config.enable_device(serial)
-    rate = round(fps or _FPS)
+    rate = max(round(fps or _FPS), 1)  # to librealsense, 0 is any rate
     config.enable_stream(rs.stream.color, *_SIZE, rs.format.rgb8, rate)
     config.enable_stream(rs.stream.depth, *_SIZE, rs.format.z16, rate)
     failure = f"has no colour and depth streams at {_SIZE[0]}x{_SIZE[1]} and {rate} Hz; set --fps to 30, 15 or 6"
