@@ -33,6 +33,7 @@ class Metrics(BaseModel):
     failure: str | None
     diagnosis: str | None = None
     difference: str | None = None
+    sequence_digest: str | None = None
     warnings: list[str] = []
     fps: float | None
     seconds: float
