@@ -42,6 +42,10 @@ class MaskFolder:
     Args:
         folder: Folder of the id images.
 
+    Attributes:
+        folder: Folder of the id images.
+        labels: COCO class of each id; None if all instances are people.
+
     Raises:
         InputError: If the folder is missing or contains no PNG file, or ``labels.yaml`` is invalid.
     """
@@ -54,7 +58,7 @@ class MaskFolder:
         if not self._paths:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
         labels = [path for name in ("labels.yaml", "labels.yml") if (path := folder / name).is_file()]
-        self._labels = _read_labels(labels[0]) if labels else None
+        self.labels = _read_labels(labels[0]) if labels else None
         stamps = [stamp for path in self._paths if (stamp := stamp_in_name(path)) is not None]
         self._stamps: Tensor | None = None
         if len(stamps) == len(self._paths):
@@ -94,7 +98,12 @@ class MaskFolder:
             InputError: If the frame has no id image, or the image is unreadable, of another size or of several
                 channels, or has too many ids.
         """
-        path = self._find_path(frame)
+        path = self.find_path(frame.index, frame.stamp)
+        if path is None:
+            raise InputError(
+                f"{self.folder}: has no id image for frame {frame.index} at {frame.stamp:.6f} s;"
+                " add it, or name the folder that belongs to this sequence"
+            )
         values = _read_ids(path)
         if values.shape != frame.image.shape[1:]:
             sizes = [f"{width}x{height}" for height, width in (values.shape, frame.image.shape[1:])]
@@ -108,9 +117,9 @@ class MaskFolder:
                 " instance and 0 for the background, name the folder of such images with --masks"
             )
         labels = torch.full_like(ids, PERSON)
-        if self._labels is not None:
-            ids = torch.tensor([i for i in ids.tolist() if i in self._labels], dtype=torch.int64)
-            labels = torch.tensor([self._labels[i] for i in ids.tolist()], dtype=torch.int64)
+        if self.labels is not None:
+            ids = torch.tensor([i for i in ids.tolist() if i in self.labels], dtype=torch.int64)
+            labels = torch.tensor([self.labels[i] for i in ids.tolist()], dtype=torch.int64)
         masks = torch.from_numpy(values == ids.numpy()[:, None, None].astype(values.dtype))
         instances = Instances(
             masks=masks,
@@ -120,19 +129,17 @@ class MaskFolder:
         )
         return instances, ids
 
-    def _find_path(self, frame: RGBDFrame) -> Path:
-        """Path of the id image that belongs to a frame."""
+    def find_path(self, index: int, stamp: float) -> Path | None:
+        """Return the path of the id image that belongs to a frame; None if there is none.
+
+        Args:
+            index: Position of the frame in its sequence.
+            stamp: Timestamp of the frame, seconds.
+        """
         if self._stamps is None:
-            if frame.index < len(self._paths):
-                return self._paths[frame.index]
-        else:
-            gap, nearest = (self._stamps - frame.stamp).abs().min(dim=0)
-            if gap <= _MAX_GAP:
-                return self._paths[int(nearest)]
-        raise InputError(
-            f"{self.folder}: has no id image for frame {frame.index} at {frame.stamp:.6f} s;"
-            " add it, or name the folder that belongs to this sequence"
-        )
+            return self._paths[index] if index < len(self._paths) else None
+        gap, nearest = (self._stamps - stamp).abs().min(dim=0)
+        return self._paths[int(nearest)] if gap <= _MAX_GAP else None
 
 
 def _read_ids(path: Path) -> NDArray[Any]:
