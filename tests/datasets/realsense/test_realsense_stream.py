@@ -347,6 +347,13 @@ def test_missing_camera_is_an_input_error(name: str, label: str) -> None:
         open_source(name, options=SourceOptions(depth_topic="/a"))
 
 
+def test_path_with_the_name_of_a_camera_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "realsense").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^realsense: is a path and the name of a camera; pass \./realsense or real"):
+        open_source("realsense")
+
+
 def test_missing_pyrealsense2_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(InputError, match=r"^realsense: RealSense needs pyrealsense2 .*; run pip install pyrealsense2$"):
