@@ -23,6 +23,10 @@ from v3d_torch.types import Instances, RGBDFrame
 _MAX_GAP = 0.02
 """Maximum time between an id image and its frame, seconds: the tolerance of the TUM tools between colour and depth."""
 
+_MAX_GAP_RATIO = 0.49
+"""Maximum time between an id image and its frame, in median intervals of the id images: from half an interval on, a
+file would also belong to a frame beside its own, whose id image is missing."""
+
 _MAX_INSTANCES = 255
 """Maximum number of instances in an image. A depth image given by mistake has thousands of values, each of which would
 become a mask of full size."""
@@ -32,9 +36,9 @@ class MaskFolder:
     """Instances from id images: single-channel PNG files, 8 or 16 bit, 0 = background, other values = instance ids.
 
     If all names end in a timestamp such as ``1305031102.175304.png`` (`stamp_in_name`), a file belongs to the nearest
-    frame in time, at most 0.02 s away. Files with other names belong to the frames in the order of their names, in
-    which numbers are compared as numbers: 9.png comes before 10.png. `check_number` checks that there is one for each
-    frame.
+    frame in time, at most 0.02 s and less than half of the interval between id images away. Files with other names
+    belong to the frames in the order of their names, in which numbers are compared as numbers: 9.png comes before
+    10.png. `check_number` checks that there is one for each frame.
 
     A file ``labels.yaml`` (or ``labels.yml``) in the folder gives the COCO class of each id, a line ``4: chair`` for
     each; ids that it does not list are no instances. Without this file, all instances are people.
@@ -61,8 +65,12 @@ class MaskFolder:
         self.labels = _read_labels(labels[0]) if labels else None
         stamps = [stamp for path in self._paths if (stamp := stamp_in_name(path)) is not None]
         self._stamps: Tensor | None = None
+        self._max_gap = _MAX_GAP
         if len(stamps) == len(self._paths):
             self._stamps = torch.tensor(stamps, dtype=torch.float64)
+            if len(stamps) > 1:
+                interval = float(self._stamps.sort().values.diff().median())
+                self._max_gap = min(_MAX_GAP, _MAX_GAP_RATIO * interval)
 
     def check_number(self, frames: int) -> None:
         """Check that files without timestamps in their names can belong to the frames in order.
@@ -139,7 +147,7 @@ class MaskFolder:
         if self._stamps is None:
             return self._paths[index] if index < len(self._paths) else None
         gap, nearest = (self._stamps - stamp).abs().min(dim=0)
-        return self._paths[int(nearest)] if gap <= _MAX_GAP else None
+        return self._paths[int(nearest)] if gap <= self._max_gap else None
 
 
 def _read_ids(path: Path) -> NDArray[Any]:
