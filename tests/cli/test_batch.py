@@ -477,6 +477,17 @@ def test_configurations_with_same_name_are_rejected(moment: Path, tmp_path: Path
     assert_error_line(result, tmp_path / "paper.yaml", "also named paper")
 
 
+@pytest.mark.parametrize("resume", [False, True])
+def test_folder_of_an_ablation_study_is_error(resume: bool, moment: Path, tmp_path: Path) -> None:
+    """Its runs have the same folders as those of a batch, but times that are not those of single runs."""
+    (tmp_path / "moment" / "baseline" / "seed0").mkdir(parents=True)
+    (tmp_path / "moment" / "baseline" / "seed0" / "run.log").touch()
+    (tmp_path / "ablation.csv").touch()
+    result = call("--seqs", moment, "--configs", "baseline", "--out", tmp_path, *["--resume"] * resume)
+    assert_error_line(result, f"{tmp_path}: contains an ablation study; choose another folder with --out")
+    assert not (tmp_path / "runs.parquet").exists()
+
+
 @pytest.mark.parametrize("below", [False, True])
 def test_file_in_place_of_result_folder_is_error(below: bool, moment: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")

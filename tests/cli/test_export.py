@@ -209,6 +209,21 @@ def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_pat
         assert_error_line(call(*arguments, tmp_path / f"to_{name}", "--seq", tmp_path / name), words)
 
 
+def test_other_sequence_with_the_same_timestamps_is_an_error_or_noted(
+    results: Path, sequence: Path, tmp_path: Path
+) -> None:
+    arguments = (results, "--format", "nerfstudio", "--every", "6", "--out")
+    other = tmp_path / "other"
+    shutil.copytree(sequence, other)
+    done = call(*arguments, tmp_path / "renamed", "--seq", other)
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert "note: the run was of walk; check that other has the same images" in done.stdout
+    (other / "groundtruth.txt").unlink()
+    done = call(*arguments, tmp_path / "out", "--seq", other)
+    assert_error_line(done, "other: is another sequence than walk")
+    assert not (tmp_path / "out").exists()
+
+
 def test_broken_frames_that_the_run_skipped_are_left_out(sequence: Path, tmp_path: Path) -> None:
     shutil.copytree(sequence, tmp_path / "walk")
     broken = sorted((tmp_path / "walk" / "rgb").iterdir())[2]

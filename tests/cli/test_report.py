@@ -259,6 +259,20 @@ def test_warnings_of_the_run_are_shown(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("without_plots")
+def test_latency_and_dropped_frames_of_a_live_run_are_shown(copy: Path) -> None:
+    metrics = json.loads((copy / "metrics.json").read_text())
+    assert "Latency" not in page_of(copy).text
+    metrics["pose_latency"] = {"median": 0.0212, "p95": 0.04, "max": 0.1}
+    metrics["latency"] = {"median": 0.05, "p95": 0.09, "max": 0.2}
+    metrics |= {"dropped": 7, "rejected": 2, "frames": 90, "keyframes": 1, "loops": 1}
+    write_text(copy / "metrics.json", json.dumps(metrics))
+    text = " ".join(page_of(copy).text.split())
+    assert "Latency of poses: median 21.2 ms, 95 % below 40.0 ms. Latency of results: median 50.0 ms" in text
+    assert "Dropped: 7 of 90 frames, 2 late or out of order." in text
+    assert "1 keyframe 1 loop closed" in text
+
+
+@pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(
     ("seconds", "expected"),
     [

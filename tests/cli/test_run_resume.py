@@ -560,6 +560,50 @@ def test_run_resumes_if_only_frames_that_were_not_processed_have_changed(
     assert_same_maps(out, tmp_path / "expected")
 
 
+def draw_another_person(ids: Path) -> Path:
+    """Change the id image of a processed frame."""
+    path = sorted(ids.iterdir())[2]
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image[:10, ::3] = 2
+    path.write_bytes(base.png(image))
+    return path
+
+
+def write_labels(ids: Path) -> Path:
+    (ids / "labels.yaml").write_text("1: chair\n")
+    return ids / "labels.yaml"
+
+
+def remove_mask(ids: Path) -> Path:
+    path = sorted(ids.iterdir())[3]
+    path.unlink()
+    return path
+
+
+@pytest.mark.parametrize("change", [draw_another_person, write_labels, remove_mask])
+def test_run_with_other_id_images_is_not_resumed(
+    change: Callable[[Path], Path], sequence: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(sequence, tmp_path / "seq")
+    out = tmp_path / "out"
+    interrupt_run(tmp_path / "seq", out, 4)
+    changed = change(tmp_path / "seq" / "ids")
+    assert_error_line(
+        call("--resume", out),
+        f"error: {changed}: has changed since the run in {out} began; restore it, or start a new run\n",
+    )
+    assert len((out / "trajectory.txt").read_text().splitlines()) == 5
+
+
+def test_run_whose_later_id_images_have_changed_is_resumed(sequence: Path, tmp_path: Path) -> None:
+    shutil.copytree(sequence, tmp_path / "seq")
+    interrupt_run(tmp_path / "seq", tmp_path / "out", 4)
+    path = sorted((tmp_path / "seq" / "ids").iterdir())[9]
+    path.write_bytes(base.png(np.zeros_like(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))))
+    done = call("--resume", tmp_path / "out")
+    assert (done.exit_code, done.stderr) == (0, "")
+
+
 def test_resumed_run_ignores_data_folder_of_the_environment(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -118,6 +118,8 @@ def test_numbers_without_a_depth_scale_are_read(tmp_path: Path) -> None:
         (KALIBR.replace("318.64304, ", ""), r"is an incomplete camera file \(not enough values to unpack"),
         (ORB_SLAM2.replace("Camera.cy", "#"), r"is an incomplete camera file \('Camera.cy' is missing\)"),
         (ORB_SLAM2.replace("Camera.k1: 0.262383", "Camera.k1: wide"), "could not convert string to float: 'wide'"),
+        (ORB_SLAM2.replace("Camera.k1: 0.262383", "Camera.k1: yes"), r"incomplete camera file \(True is not a number"),
+        (ROS.replace("data: [517.306408, 0, ", "data: [true, 0, "), r"incomplete camera file \(True is not a number"),
         (ORB_SLAM2.replace("Camera.fx: 517", "Camera.fx: -517"), "fx: input should be greater than or equal to 1"),
         (ORB_SLAM2.replace("Factor: 5000.0", "Factor: 0.0002"), "depth_scale: input should be greater than or equal"),
         (ROS.replace("data: [517.306408, 0, ", "data: ["), r"contains|incomplete camera file|fy: "),

@@ -92,6 +92,16 @@ def test_files_named_by_timestamp_belong_to_the_nearest_frame(tmp_path: Path) ->
         masks(frame(9, 5.075))
 
 
+def test_missing_file_is_not_replaced_by_that_of_the_next_frame(tmp_path: Path) -> None:
+    """At 60 Hz, the files of the frames before and after are only 16.7 ms away."""
+    for value in (1, 2, 3, 5, 6):
+        Image.fromarray(ids(np.uint8, value)).save(tmp_path / f"{value / 60:.6f}.png")
+    masks = MaskFolder(tmp_path)
+    assert masks.read(frame(2, 3 / 60 + 0.005))[1].tolist() == [3]
+    with pytest.raises(InputError, match=r"no id image for frame 3 at 0\.066667 s"):
+        masks(frame(3, round(4 / 60, 6)))
+
+
 @pytest.mark.parametrize("name", ["{:.0f}", "mask_{:.0f}"])
 def test_names_in_nanoseconds_belong_to_the_nearest_frame(tmp_path: Path, name: str) -> None:
     start = 1_403_636_579.763555

@@ -82,6 +82,10 @@ def test_one_or_two_frames_are_drawn(frames: int) -> None:
         "statuses": draw_statuses(estimate.stamps, ["tracked"] * frames, estimate.stamps[:1]),
     }.items():
         assert embed_svg(figure, name).startswith("<svg")
+        if name == "statuses":
+            assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "1 keyframe"
+        else:  # a line needs two points to be visible, a marker one
+            assert all(frames > 1 or axes.lines[0].get_marker() == "." for axes in figure.axes)
 
 
 def test_cells_of_frames_leave_gaps_empty() -> None:

@@ -109,6 +109,11 @@ def test_guessed_poses_are_dotted(truth: Trajectory | None, tmp_path: Path) -> N
     assert "disconnected" not in (tmp_path / "figure.svg").read_text()
 
 
+def test_legend_of_a_run_without_measured_poses_lists_no_estimate() -> None:
+    figure = draw_trajectory(None, arc(), statuses=60 * ["lost"])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["estimate, lost", "start"]
+
+
 def test_same_trajectory_gives_same_bytes(tmp_path: Path) -> None:
     for name in ("a", "b"):
         save_trajectory_figure(arc(), shaken(arc()), tmp_path / f"{name}.png")

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from v3d_torch.batch.batch_record import RUNS_TABLE
+from v3d_torch.batch.batch_record import RUNS_TABLE, STUDY_TABLE
 from v3d_torch.batch.plan import check_configs
 from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config, SegmentationConfig
@@ -40,9 +40,6 @@ from v3d_torch.runs.result_folder import lock_results, make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_instance_source, make_segmenter, wrap_upright
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
-
-_TABLE = "ablation.csv"
-"""Name of the table with all values, which every study writes after its first run."""
 
 _NOTE = (
     "Variants with the same input of the network shared its results, and all runs shared one process: times and memory"
@@ -138,7 +135,7 @@ def _run_variants(
         data_root: Folder of named sequences, with which another command finds them again; None for ``$V3D_DATA``.
         console: Console for progress and tables.
     """
-    for table, contents in ((_TABLE, "an earlier study"), (RUNS_TABLE, "a batch")):
+    for table, contents in ((STUDY_TABLE, "an earlier study"), (RUNS_TABLE, "a batch")):
         if (folder / table).exists():
             raise InputError(f"{folder}: contains {contents}; choose another folder with --out")
     outcomes: list[Outcome] = []
@@ -157,7 +154,7 @@ def _run_variants(
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 print_line(console, str(outcomes[-1]))
                 write_text(folder / "ablation.md", format_markdown(outcomes, _NOTE))
-                write_text(folder / _TABLE, format_csv(outcomes))
+                write_text(folder / STUDY_TABLE, format_csv(outcomes))
             console.print(make_screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
     except KeyboardInterrupt as interrupt:
         done, total = len(outcomes), len(configs) * len(sequences)

@@ -43,6 +43,9 @@ The name of a column is the key with ``_`` instead of the dots.
 RUNS_TABLE = "runs.parquet"
 """Name of the table of the runs, which a batch writes before its first run."""
 
+STUDY_TABLE = "ablation.csv"
+"""Name of the table with all values, which an ablation study writes after its first run."""
+
 _SCHEMA = pa.schema(
     [
         ("sequence", pa.string()),
@@ -138,6 +141,11 @@ class BatchRecord:
 def has_batch(folder: Path) -> bool:
     """Check whether a folder is that of a batch: it has the table of its runs from the start, or runs."""
     return (folder / RUNS_TABLE).is_file() or next(folder.glob(f"*/*/seed*/{RunFile.LOG}"), None) is not None
+
+
+def has_study_only(folder: Path) -> bool:
+    """Check whether a folder is that of an ablation study. A reproduction has both tables."""
+    return (folder / STUDY_TABLE).is_file() and not (folder / RUNS_TABLE).is_file()
 
 
 def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:

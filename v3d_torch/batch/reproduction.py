@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console, RenderableType
 
-from v3d_torch.batch.batch_record import BatchRecord
+from v3d_torch.batch.batch_record import STUDY_TABLE, BatchRecord
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
@@ -138,7 +138,7 @@ class ReproductionRecord(BatchRecord):
             legend = f"{LEGEND} {ablation.RATIO_LEGEND}"
             write_text(self.folder / "ablation.md", "\n".join(document) + "\n")
             write_text(self.folder / "ablation.tex", format_latex_document([table], legend))
-            write_text(self.folder / "ablation.csv", ablation.format_csv(self._study_outcomes))
+            write_text(self.folder / STUDY_TABLE, ablation.format_csv(self._study_outcomes))
 
     def progress_table(self) -> ErrorTable | None:
         """Return the first of the paper's tables, to show while jobs run, the newest rows last; None without errors."""

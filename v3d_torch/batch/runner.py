@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from v3d_torch.batch.batch_record import BatchRecord, has_batch
+from v3d_torch.batch.batch_record import BatchRecord, has_batch, has_study_only
 from v3d_torch.batch.executor import Executor, JobFinished, JobRepeated
 from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor
@@ -91,10 +91,12 @@ def run_missing_jobs(
         advice: End of the message on failed runs: how to repeat them other than with --resume.
 
     Raises:
-        V3DError: If the folder contains runs, or its tables have runs that are not jobs of this batch, or it is not
-            writable; if the user interrupted the batch, or if a run failed.
+        V3DError: If the folder contains runs or an ablation study, or its tables have runs that are not jobs of this
+            batch, or it is not writable; if the user interrupted the batch, or if a run failed.
     """
     folder = record.folder
+    if has_study_only(folder):  # times and memory of its runs are not those of single runs
+        raise InputError(f"{folder}: contains an ablation study; choose another folder with --out")
     if record.outcomes and not resume:
         raise InputError(
             f"{folder}: contains runs of an earlier batch; continue it with --resume, or choose another folder"

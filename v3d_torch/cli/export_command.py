@@ -28,7 +28,13 @@ from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import RunRequest, read_request
-from v3d_torch.runs.run_images import LocalisedFrames, localised_frames, open_images, posed_images
+from v3d_torch.runs.run_images import (
+    LocalisedFrames,
+    localised_frames,
+    note_other_name,
+    open_images,
+    posed_images,
+)
 from v3d_torch.runs.stored_run import StoredRun, read_run
 
 _MAX_IMAGES = 300
@@ -79,6 +85,7 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
         source = open_images(run, request, ProgressBar(progress, "sequence"))
     frames = _select_frames(run, options)
     images = posed_images(run, source, frames, masks=options.masks)
+    other_name = note_other_name(run, source)
     shown: Iterable[PosedImage] = track(
         images, "exporting", len(frames), console=console, disable=not console.is_terminal
     )
@@ -88,8 +95,7 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
         out_camera, shown = undistort.camera, map(undistort, shown)
     with emptied_on_failure(out):  # else, the same command would reject the folder
         notes = _WRITERS[options.format](out, _Export(run, request, source, frames), out_camera, shown)
-    if (note := _note_early_end(run)) is not None:
-        notes.append(note)
+    notes += [note for note in (other_name, _note_early_end(run)) if note is not None]
     if left_out := len(run.metrics.status) - len(localised_frames(run)):
         notes.append(f"{left_out} frames without a known pose are left out")
     print_line(console, f"{len(frames)} images: {out}")

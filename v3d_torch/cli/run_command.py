@@ -37,6 +37,7 @@ from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest
 from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.segmentation import MaskFolder, make_segmenter
@@ -193,6 +194,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
     if isinstance(segment, MaskFolder) and isinstance(sequence, Sized) and checkpoint is None:
         segment.check_number(len(sequence))
+    if checkpoint is not None:
+        _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
     viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
     if checkpoint is not None:
@@ -215,6 +218,18 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
             f"{folder}: interrupted before the results were written{_way_to_resume(folder, sequence)}"
         ) from interrupt
     _print_summary(request, display, folder, pipeline, evaluation, console)
+
+
+def _check_segmentation(checkpoint: Checkpoint, files: SegmentationFiles) -> None:
+    """Check that the weights, or the id images of the processed frames, are those of the run.
+
+    Raises:
+        InputError: If a file has changed.
+    """
+    if checkpoint.segmentation and (changed := files.changed_file(checkpoint.segmentation)) is not None:
+        raise InputError(
+            f"{changed}: has changed since the run in {checkpoint.folder} began; restore it, or start a new run"
+        )
 
 
 def _check_map_path(path: Path, out: Path | None, display: Display) -> None:

@@ -71,6 +71,9 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
     Raises:
         InputError: If a field is missing, unknown or out of range.
     """
+    for name, value in fields.items():
+        if any(isinstance(each, bool) for each in (value if isinstance(value, list | tuple) else (value,))):
+            raise InputError(f"{source}: {name}: input should be a number, got {value}; correct the camera")
     if to_float(fields.get("fy")) < 0:
         raise InputError(f"{source}: fy is {fields['fy']}; {NEGATIVE_FY}")
     try:

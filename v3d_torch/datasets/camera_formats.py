@@ -157,6 +157,8 @@ def _numbers(node: Any) -> list[float]:
 
 
 def _number(value: Any) -> float:
+    if isinstance(value, bool):
+        raise ValueError(f"{value} is not a number")
     return float(value)  # YAML reads numbers such as 1e-05, which have no decimal point, as text
 
 

@@ -141,6 +141,8 @@ def _open_by_name(
         reject_options(name, "a rendered sequence", options, frozenset())
         return TUMSequence(ensure_demo(cache_dir(), progress, name), camera, name=name)
     if is_live(name):
+        if name == "realsense" and Path(name).exists():
+            raise InputError(f"{name}: is a path and the name of a camera; pass ./{name} or {name}: to choose one")
         reject_options(name.removesuffix(":"), "a live camera", options, frozenset({"fps"}))
         return open_realsense_camera(name, camera, fps=options.fps)
     path = find_or_download(name, data_root=data_root, download=download, progress=progress)

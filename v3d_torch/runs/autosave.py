@@ -15,6 +15,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.segmentation_files import SegmentationFiles
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,6 +37,8 @@ class Autosave:
         self._pipeline = pipeline
         self._request = request
         self._sizes = FileSizes(pipeline.sequence)
+        weights = None if request is None else request.weights
+        self._segmentation = SegmentationFiles(weights, pipeline.slam.segment, pipeline.sequence)
         self._config = pipeline.slam.config.checkpoint
         self._due = time.perf_counter() + self._config.interval
         self._thread: ThreadPoolExecutor | None = None
@@ -99,7 +102,7 @@ class Autosave:
         if self._request is None:
             return
         start, path = time.perf_counter(), self._folder / RunFile.CHECKPOINT
-        write_checkpoint(self._folder, self._pipeline, self._request, self._sizes)
+        write_checkpoint(self._folder, self._pipeline, self._request, self._sizes, self._segmentation)
         seconds, size = time.perf_counter() - start, path.stat().st_size / 1e6
         _LOG.info("checkpoint after %d frames: %.1f MB in %.2f s", len(self._pipeline.record.times), size, seconds)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from v3d_torch.pipeline.run_record import FrameTimes, LiveTable, ObjectTable, Ru
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics, suggest_folder
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.state import STATE_CLASSES
 
 _CLASSES = (
@@ -60,6 +61,7 @@ class Checkpoint:
         sequence: Fingerprint of the processed part of the sequence, see `_fingerprint`.
         frames: Number of frames processed.
         state: State of the pipeline.
+        segmentation: Fingerprint of the files of the segmenter, see `SegmentationFiles`; empty if it is not known.
     """
 
     folder: Path
@@ -67,6 +69,7 @@ class Checkpoint:
     sequence: Mapping[str, Any]
     frames: int
     state: Mapping[str, Any]
+    segmentation: Mapping[str, Any] = field(default_factory=dict)
 
 
 class FileSizes:
@@ -96,7 +99,13 @@ def _file_size(file: Path) -> int | None:
         return None
 
 
-def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest, sizes: FileSizes) -> None:
+def write_checkpoint(
+    folder: Path,
+    pipeline: Pipeline,
+    request: RunRequest,
+    sizes: FileSizes,
+    segmentation: SegmentationFiles | None = None,
+) -> None:
     """Write the state of a run to its folder.
 
     A live stream cannot be resumed, because its frames are gone; its checkpoint contains only the request.
@@ -106,6 +115,7 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest, size
         pipeline: Pipeline between two frames, after at least one frame.
         request: Request of the run.
         sizes: Sizes of the image files of the sequence of the pipeline.
+        segmentation: Files of the segmenter of the pipeline; None if they are not compared when the run is resumed.
 
     Raises:
         OutputError: If the file cannot be written; the previous checkpoint stays.
@@ -116,6 +126,7 @@ def write_checkpoint(folder: Path, pipeline: Pipeline, request: RunRequest, size
     if isinstance(sequence, RGBDSequence):
         done = int(pipeline.record.times.indices[-1]) + 1
         metadata |= {"sequence": _fingerprint(sequence, done, sizes), "frames": len(pipeline.slam.poses)}
+        metadata["segmentation"] = {} if segmentation is None else segmentation.fingerprint(done)
         state = pipeline.state_dict()
     write_state(folder / RunFile.CHECKPOINT, metadata, state)
 
@@ -151,7 +162,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
                 f"{folder}: the run of a live stream ({request.seq}) cannot be resumed; its results so far are in"
                 " trajectory.txt"
             )
-        return Checkpoint(folder, request, metadata["sequence"], metadata["frames"], state)
+        segmentation = metadata.get("segmentation", {})  # earlier versions stored none
+        return Checkpoint(folder, request, metadata["sequence"], metadata["frames"], state, segmentation)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is not the checkpoint of a run; run the sequence again") from error
 

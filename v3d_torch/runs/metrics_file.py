@@ -33,7 +33,12 @@ class Metrics(BaseModel):
     failure: str | None
     diagnosis: str | None = None
     difference: str | None = None
+    sequence_digest: str | None = None
     warnings: list[str] = []
+    pose_latency: dict[str, float] | None = None
+    latency: dict[str, float] | None = None
+    dropped: int = 0
+    rejected: int = 0
     fps: float | None
     seconds: float
     seconds_per_stage: dict[str, float]

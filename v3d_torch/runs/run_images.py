@@ -13,6 +13,7 @@ from torch import Tensor
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
 from v3d_torch.datasets.open_source import is_live
+from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import InputError
 from v3d_torch.export.posed_image import PosedImage
 from v3d_torch.io.download import Progress
@@ -51,6 +52,25 @@ def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) 
         progress=progress,
         skip_broken=request.skip_broken,
     )
+
+
+def note_other_name(run: StoredRun, source: RGBDStream) -> str | None:
+    """Return a sentence on a source that has another name than the sequence of the run; None if the names are equal.
+
+    Timestamps alone do not distinguish sequences: those of many data sets are multiples of the frame interval.
+
+    Raises:
+        InputError: If the source also has another camera, other timestamps or another ground truth.
+    """
+    name, digest = run.metrics.sequence, run.metrics.sequence_digest
+    if source.name == name:
+        return None
+    if digest is not None and isinstance(source, RGBDSequence) and sequence_digest(source) != digest:
+        raise InputError(
+            f"{source.name}: is another sequence than {name} of the run in {run.folder} (camera, timestamps or ground"
+            " truth differ); pass the sequence of this run with --seq"
+        )
+    return f"the run was of {name}; check that {source.name} has the same images"
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,10 @@ from v3d_torch.types import Instances, RGBDFrame
 _MAX_GAP = 0.02
 """Maximum time between an id image and its frame, seconds: the tolerance of the TUM tools between colour and depth."""
 
+_MAX_GAP_RATIO = 0.49
+"""Maximum time between an id image and its frame, in median intervals of the id images: from half an interval on, a
+file would also belong to a frame beside its own, whose id image is missing."""
+
 _MAX_INSTANCES = 255
 """Maximum number of instances in an image. A depth image given by mistake has thousands of values, each of which would
 become a mask of full size."""
@@ -32,15 +36,19 @@ class MaskFolder:
     """Instances from id images: single-channel PNG files, 8 or 16 bit, 0 = background, other values = instance ids.
 
     If all names end in a timestamp such as ``1305031102.175304.png`` (`stamp_in_name`), a file belongs to the nearest
-    frame in time, at most 0.02 s away. Files with other names belong to the frames in the order of their names, in
-    which numbers are compared as numbers: 9.png comes before 10.png. `check_number` checks that there is one for each
-    frame.
+    frame in time, at most 0.02 s and less than half of the interval between id images away. Files with other names
+    belong to the frames in the order of their names, in which numbers are compared as numbers: 9.png comes before
+    10.png. `check_number` checks that there is one for each frame.
 
     A file ``labels.yaml`` (or ``labels.yml``) in the folder gives the COCO class of each id, a line ``4: chair`` for
     each; ids that it does not list are no instances. Without this file, all instances are people.
 
     Args:
         folder: Folder of the id images.
+
+    Attributes:
+        folder: Folder of the id images.
+        labels: COCO class of each id; None if all instances are people.
 
     Raises:
         InputError: If the folder is missing or contains no PNG file, or ``labels.yaml`` is invalid.
@@ -54,11 +62,15 @@ class MaskFolder:
         if not self._paths:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
         labels = [path for name in ("labels.yaml", "labels.yml") if (path := folder / name).is_file()]
-        self._labels = _read_labels(labels[0]) if labels else None
+        self.labels = _read_labels(labels[0]) if labels else None
         stamps = [stamp for path in self._paths if (stamp := stamp_in_name(path)) is not None]
         self._stamps: Tensor | None = None
+        self._max_gap = _MAX_GAP
         if len(stamps) == len(self._paths):
             self._stamps = torch.tensor(stamps, dtype=torch.float64)
+            if len(stamps) > 1:
+                interval = float(self._stamps.sort().values.diff().median())
+                self._max_gap = min(_MAX_GAP, _MAX_GAP_RATIO * interval)
 
     def check_number(self, frames: int) -> None:
         """Check that files without timestamps in their names can belong to the frames in order.
@@ -94,7 +106,12 @@ class MaskFolder:
             InputError: If the frame has no id image, or the image is unreadable, of another size or of several
                 channels, or has too many ids.
         """
-        path = self._find_path(frame)
+        path = self.find_path(frame.index, frame.stamp)
+        if path is None:
+            raise InputError(
+                f"{self.folder}: has no id image for frame {frame.index} at {frame.stamp:.6f} s;"
+                " add it, or name the folder that belongs to this sequence"
+            )
         values = _read_ids(path)
         if values.shape != frame.image.shape[1:]:
             sizes = [f"{width}x{height}" for height, width in (values.shape, frame.image.shape[1:])]
@@ -108,9 +125,9 @@ class MaskFolder:
                 " instance and 0 for the background, name the folder of such images with --masks"
             )
         labels = torch.full_like(ids, PERSON)
-        if self._labels is not None:
-            ids = torch.tensor([i for i in ids.tolist() if i in self._labels], dtype=torch.int64)
-            labels = torch.tensor([self._labels[i] for i in ids.tolist()], dtype=torch.int64)
+        if self.labels is not None:
+            ids = torch.tensor([i for i in ids.tolist() if i in self.labels], dtype=torch.int64)
+            labels = torch.tensor([self.labels[i] for i in ids.tolist()], dtype=torch.int64)
         masks = torch.from_numpy(values == ids.numpy()[:, None, None].astype(values.dtype))
         instances = Instances(
             masks=masks,
@@ -120,19 +137,17 @@ class MaskFolder:
         )
         return instances, ids
 
-    def _find_path(self, frame: RGBDFrame) -> Path:
-        """Path of the id image that belongs to a frame."""
+    def find_path(self, index: int, stamp: float) -> Path | None:
+        """Return the path of the id image that belongs to a frame; None if there is none.
+
+        Args:
+            index: Position of the frame in its sequence.
+            stamp: Timestamp of the frame, seconds.
+        """
         if self._stamps is None:
-            if frame.index < len(self._paths):
-                return self._paths[frame.index]
-        else:
-            gap, nearest = (self._stamps - frame.stamp).abs().min(dim=0)
-            if gap <= _MAX_GAP:
-                return self._paths[int(nearest)]
-        raise InputError(
-            f"{self.folder}: has no id image for frame {frame.index} at {frame.stamp:.6f} s;"
-            " add it, or name the folder that belongs to this sequence"
-        )
+            return self._paths[index] if index < len(self._paths) else None
+        gap, nearest = (self._stamps - stamp).abs().min(dim=0)
+        return self._paths[int(nearest)] if gap <= self._max_gap else None
 
 
 def _read_ids(path: Path) -> NDArray[Any]:

@@ -104,7 +104,7 @@ def draw_statuses(stamps: Tensor, statuses: Sequence[str], keyframes: Tensor) ->
     edges, row = frame_cells(seconds, row)
     axes.pcolormesh(edges, [0.35, 1.0], row, cmap=colours, vmin=-0.5, vmax=vmax, rasterized=True)
     (marks,) = axes.plot(keyframes - stamps[0], np.full(len(keyframes), 0.15), "|", color="black")
-    marks.set_label(f"{len(keyframes)} keyframes")
+    marks.set_label(f"{len(keyframes)} {'keyframe' if len(keyframes) == 1 else 'keyframes'}")
     axes.set(ylim=(0, 1.05), yticks=[])
     axes.grid(False)
     counts = {status: list(statuses).count(status) for status in names}
@@ -129,9 +129,10 @@ def draw_masked_fraction(stamps: Tensor, fractions: Tensor) -> Figure:
 
 
 def _plot_positions(panels: Sequence[Axes], seconds: Tensor, positions: Tensor, colour: str, label: str) -> None:
+    marker = "." if len(seconds) == 1 else None  # a line of one point is invisible
     for i, axes in enumerate(panels):
         curve = insert_gaps(seconds, torch.stack([seconds, positions[:, i]], dim=1))
-        axes.plot(*curve.T, color=colour, linewidth=1.0, label=label)
+        axes.plot(*curve.T, color=colour, linewidth=1.0, marker=marker, label=label)
 
 
 def _shade_untracked(axes: Axes, seconds: Tensor, statuses: Sequence[str]) -> None:

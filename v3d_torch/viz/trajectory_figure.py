@@ -94,7 +94,8 @@ def draw_trajectory(
         points, guesses = positions[:, plane], None
         if label == "estimate" and guessed:
             points, guesses = _separate_guesses(points, statuses)
-        axes.plot(*insert_gaps(stamps, points).T, color=colour, linewidth=1.2, label=label)
+        if not points.isnan().all():  # else the legend would list a curve without points
+            axes.plot(*insert_gaps(stamps, points).T, color=colour, linewidth=1.2, label=label)
         if guesses is not None:
             label = f"estimate, {' or '.join(guessed)}"
             axes.plot(*insert_gaps(stamps, guesses).T, ":", color="tab:orange", linewidth=1.5, label=label)

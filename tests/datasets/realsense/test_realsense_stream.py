@@ -359,6 +359,13 @@ def test_frame_rate_is_requested(monkeypatch: pytest.MonkeyPatch, fps: float | N
     assert [call.args[-1] for call in library.config.return_value.enable_stream.call_args_list] == [requested] * 2
 
 
+def test_path_with_the_name_of_a_camera_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "realsense").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^realsense: is a path and the name of a camera; pass \./realsense or real"):
+        open_source("realsense")
+
+
 def test_missing_pyrealsense2_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(InputError, match=r"^realsense: RealSense needs pyrealsense2 .*; run pip install pyrealsense2$"):
