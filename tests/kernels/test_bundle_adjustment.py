@@ -101,7 +101,7 @@ def test_kernel_of_the_derivatives_equals_its_twin(name: str) -> None:
     problem = PROBLEMS[name][2]
     derivative = torch.randn(problem.scale.shape, generator=torch.Generator().manual_seed(1)).double()
     at_minimum = adjust(*PROBLEMS[name], compiled=False, iterations=20)
-    arguments = at_minimum.T_cw, at_minimum.points, *problem, derivative
+    arguments = at_minimum.T_cw, at_minimum.points, derivative, *problem
     expected, found = (torch.stack(DERIVATIVES[compiled](*arguments)) for compiled in (False, True))
     torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-6 * max(1.0, abs(float(expected[1]))))
 

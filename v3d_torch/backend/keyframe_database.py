@@ -1,4 +1,4 @@
-"""Place recognition without a vocabulary, by votes of similar ORB descriptors.
+"""Place recognition without a vocabulary, by the number of similar ORB descriptors.
 
 The scoring follows DBoW2 (Galvez-Lopez and Tardos, T-RO 2012), with hash buckets of descriptors in place of visual
 words.
@@ -26,9 +26,9 @@ _MAX_DISTANCE = 50
 class KeyframeDatabase:
     """Database of keyframes that is queried by descriptors; it needs no training.
 
-    A descriptor of the query votes for every keyframe that has a similar descriptor: in the same hash bucket, and with
-    a Hamming distance below a threshold. Votes are weighted as in text retrieval, by inverse document frequency:
-    descriptors that match many keyframes contribute little.
+    The score of a keyframe is the sum of the weights of the descriptors of the query that match one of its descriptors:
+    in the same hash bucket, and with a Hamming distance below a threshold. The weight is that of text retrieval, the
+    inverse document frequency: descriptors that match many keyframes contribute little.
     """
 
     def __init__(self) -> None:
@@ -75,19 +75,18 @@ class KeyframeDatabase:
 
         Returns:
             Pairs (id, score) with score > 0, best first; of equal scores, the keyframe added earlier is first. The
-            score is the mean weighted vote of a descriptor. It ranks the keyframes of one query; it is not a
-            probability.
+            score is divided by the number of descriptors. It ranks the keyframes of one query; it is not a probability.
         """
         ids = np.array(list(self._descriptors), dtype=np.int64)
         count, is_active = len(ids), ~np.isin(ids, list(self._removed))
         if len(self) == 0 or descriptors.shape[0] == 0:
             return []
         bounds, _, matches = self._index.range_search(descriptors.contiguous().numpy(), _MAX_DISTANCE)
-        voter = np.repeat(np.arange(descriptors.shape[0]), np.diff(bounds).astype(np.int64))
+        descriptor = np.repeat(np.arange(descriptors.shape[0]), np.diff(bounds).astype(np.int64))
         owner = self._owner[matches]
-        # A descriptor has one vote for each keyframe, even if it matches several descriptors of that keyframe.
-        voter, keyframe = np.divmod(np.unique((voter * count + owner)[is_active[owner]]), count)
-        weight = np.log1p(len(self) / np.bincount(voter, minlength=1)[voter])
+        # A descriptor counts once for each keyframe, even if it matches several descriptors of that keyframe.
+        descriptor, keyframe = np.divmod(np.unique((descriptor * count + owner)[is_active[owner]]), count)
+        weight = np.log1p(len(self) / np.bincount(descriptor, minlength=1)[descriptor])
         score = np.bincount(keyframe, weights=weight, minlength=count) / descriptors.shape[0]
         score[np.isin(ids, list(exclude))] = 0.0
         order = np.argsort(-score, kind="stable")[:k]

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,6 +17,7 @@ from v3d_torch.mapping.covisibility import count_shared_landmarks, covisibility_
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.odometry.motion_estimator import MotionEstimator
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 
 _MIN_SHARED_LANDMARKS = 30
@@ -54,8 +54,10 @@ class LoopCorrection:
     T_cw: Tensor
 
 
-class LoopCloser:
+class LoopCloser(StatefulComponent):
     """Recognises places in the map: to relocalise a lost camera, and to detect and correct loops.
+
+    Its state does not contain the database of keyframes: after `load_state_dict`, call `rebuild_database`.
 
     Args:
         config: Configuration of loop closing.
@@ -66,6 +68,8 @@ class LoopCloser:
     Attributes:
         loop_count: Number of loops that were corrected.
     """
+
+    _STATE = ("loop_count",)
 
     def __init__(self, config: LoopConfig, motion: MotionEstimator, tracker: MapTracker, local_keyframes: int) -> None:
         self._config = config
@@ -92,14 +96,6 @@ class LoopCloser:
         self._database = KeyframeDatabase()
         for keyframe in keyframes:
             self.add_keyframe(keyframe)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the number of loops, ``{"loop_count": int}``; `rebuild_database` restores the rest."""
-        return {"loop_count": self.loop_count}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`; call `rebuild_database` as well."""
-        self.loop_count = state["loop_count"]
 
     def relocalise(self, features: Features, sparse_map: SparseMap) -> PlaceMatch | None:
         """Find the place in the map at which an image was taken.

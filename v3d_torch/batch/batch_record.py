@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -66,14 +66,25 @@ class BatchRecord:
     Args:
         jobs: All jobs of the batch.
         folder: Folder of the results.
+        table_configs: Names of the configurations in the tables; None for all.
+        absent: Sequences of the paper that are not available; they have a row without values in the tables.
 
     Raises:
         InputError: If a complete run in the folder has another configuration or another sequence.
     """
 
-    def __init__(self, jobs: Sequence[Job], folder: Path) -> None:
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        folder: Path,
+        *,
+        table_configs: Collection[str] | None = None,
+        absent: Sequence[str] = (),
+    ) -> None:
         self.jobs = jobs
         self.folder = folder
+        self._table_configs = table_configs
+        self._absent = absent
         self._table = folder / RUNS_TABLE
         self._outcomes = {job.folder: outcome for job in jobs if (outcome := job.earlier_outcome()) is not None}
 
@@ -119,15 +130,22 @@ class BatchRecord:
         Raises:
             OutputError: If the folder is not writable or the disk is full.
         """
-        write_text(self.folder / "summary.md", format_markdown(self.outcomes))
-        write_text(self.folder / "summary.tex", format_latex(self.outcomes))
-        write_text(self.folder / "summary.csv", format_csv(self.outcomes))
+        outcomes = self._table_outcomes
+        write_text(self.folder / "summary.md", format_markdown(outcomes, self._absent))
+        write_text(self.folder / "summary.tex", format_latex(outcomes, self._absent))
+        write_text(self.folder / "summary.csv", format_csv(outcomes, self._absent))
+
+    @property
+    def _table_outcomes(self) -> list[Outcome]:
+        """Outcomes in the tables."""
+        configs = self._table_configs
+        return [outcome for outcome in self.outcomes if configs is None or outcome.config in configs]
 
     @property
     def outcomes_newest_last(self) -> list[Outcome]:
-        """Outcomes of the jobs that have ended, those of the sequence of the newest one last."""
+        """Outcomes in the tables, those of the sequence of the newest one last."""
         ends = {outcome.sequence: end for end, outcome in enumerate(self._outcomes.values())}
-        return sorted(self.outcomes, key=lambda outcome: ends[outcome.sequence])
+        return sorted(self._table_outcomes, key=lambda outcome: ends[outcome.sequence])
 
     def progress_table(self) -> ErrorTable | None:
         """Return the table to show while jobs run, the newest rows last; None if there are no errors yet."""
@@ -135,7 +153,7 @@ class BatchRecord:
 
     def screen_tables(self) -> list[RenderableType]:
         """Return the summary as tables for the screen, and their explanations."""
-        return make_screen_tables(self.outcomes)
+        return make_screen_tables(self._table_outcomes, self._absent)
 
 
 def has_batch(folder: Path) -> bool:

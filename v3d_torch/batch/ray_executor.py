@@ -92,19 +92,19 @@ class RayExecutor:
                         pending[run.remote(jobs[index], index, board)] = index
                 elif not cancelled:
                     cancelled = True
-                    for reference in pending:
-                        ray.cancel(reference)
+                    for task in pending:
+                        ray.cancel(task)
                 if not pending:
                     return
                 ended, _ = ray.wait(list(pending), timeout=_POLL_INTERVAL)
                 for index, frames in ray.get(board.take.remote()).items():
                     if index in pending.values():  # a report can arrive after the end of its job
                         yield JobProgress(jobs[index], frames)
-                for reference in ended:
-                    index = pending.pop(reference)
+                for task in ended:
+                    index = pending.pop(task)
                     job = jobs[index]
                     try:
-                        yield JobFinished(job, ray.get(reference))
+                        yield JobFinished(job, ray.get(task))
                     except ray.exceptions.TaskCancelledError:  # before it started
                         continue
                     except ray.exceptions.RayError as error:

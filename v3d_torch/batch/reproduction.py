@@ -20,16 +20,8 @@ from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, InputError
 from v3d_torch.evaluation import ablation
 from v3d_torch.evaluation.outcome import Outcome
-from v3d_torch.evaluation.summary import (
-    LEGEND,
-    format_csv,
-    format_latex,
-    format_markdown,
-    make_progress_table,
-    make_screen_tables,
-)
+from v3d_torch.evaluation.summary import LEGEND
 from v3d_torch.evaluation.tables import (
-    ErrorTable,
     format_latex_document,
     format_markdown_table,
     make_screen_legend,
@@ -100,18 +92,8 @@ class ReproductionRecord(BatchRecord):
     def __init__(
         self, jobs: Sequence[Job], folder: Path, table_configs: Sequence[str], absent: Sequence[str], *, study: bool
     ) -> None:
-        super().__init__(jobs, folder)
-        self._table_configs = table_configs
-        self._absent = absent
+        super().__init__(jobs, folder, table_configs=table_configs, absent=absent)
         self._study = study
-
-    @property
-    def _table_outcomes(self) -> list[Outcome]:
-        return self._select(self.outcomes)
-
-    def _select(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
-        """Select the outcomes of the paper's tables."""
-        return [outcome for outcome in outcomes if outcome.config in self._table_configs]
 
     @property
     def _study_outcomes(self) -> list[Outcome]:
@@ -125,9 +107,7 @@ class ReproductionRecord(BatchRecord):
         Raises:
             OutputError: If the folder is not writable or the disk is full.
         """
-        write_text(self.folder / "summary.md", format_markdown(self._table_outcomes, self._absent))
-        write_text(self.folder / "summary.tex", format_latex(self._table_outcomes, self._absent))
-        write_text(self.folder / "summary.csv", format_csv(self._table_outcomes, self._absent))
+        super().write_summaries()
         if (table := ablation.make_overview_table(self._study_outcomes, self._absent)) is not None:
             document = [
                 ablation.format_markdown(self._study_outcomes),
@@ -140,13 +120,9 @@ class ReproductionRecord(BatchRecord):
             write_text(self.folder / "ablation.tex", format_latex_document([table], legend))
             write_text(self.folder / STUDY_TABLE, ablation.format_csv(self._study_outcomes))
 
-    def progress_table(self) -> ErrorTable | None:
-        """Return the first of the paper's tables, to show while jobs run, the newest rows last; None without errors."""
-        return make_progress_table(self._select(self.outcomes_newest_last))
-
     def screen_tables(self) -> list[RenderableType]:
         """Return the paper's tables and that of the study for the screen, and their explanations."""
-        shown = make_screen_tables(self._table_outcomes, self._absent)
+        shown = super().screen_tables()
         if (table := ablation.make_overview_table(self._study_outcomes, self._absent)) is not None:
             shown += [make_screen_table(table), make_screen_legend(ablation.RATIO_LEGEND)]
         return shown

@@ -1,4 +1,4 @@
-"""How many broken frames of a stored sequence can be skipped, and the first frame that is not broken."""
+"""Maximum number of broken frames of a stored sequence, and its first frame that is not broken."""
 
 from __future__ import annotations
 

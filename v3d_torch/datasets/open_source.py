@@ -64,9 +64,7 @@ def open_source(
         GroundTruthWarning: If the ground truth cannot be read; ``groundtruth`` is None then.
         DepthScaleWarning: If the depth scale is not stated, and was estimated from the images.
     """
-    source = _open(name, data_root, camera, options or SourceOptions(), download, progress, skip_broken)
-    _warn(source)
-    return source
+    return _open(name, data_root, camera, options or SourceOptions(), download, progress, skip_broken)
 
 
 def load_sequence(
@@ -95,7 +93,6 @@ def load_sequence(
             f"{name}: is a stream, whose frames cannot be indexed; record it first with"
             f" v3d-torch record --seq {shlex.quote(str(name))} --out FOLDER"
         )
-    _warn(source)
     return source
 
 
@@ -113,16 +110,24 @@ def _open(
     progress: Progress | None,
     skip_broken: bool,
 ) -> RGBDStream:
-    """Check the arguments and open a source; file system errors become `InputError`."""
+    """Check the arguments and open a source, with warnings at the line that called this module.
+
+    File system errors become `InputError`.
+    """
     if options.fps is not None and not _MIN_FPS <= options.fps <= _MAX_FPS:
         raise InputError(f"--fps {options.fps:g}: is out of range; pass between {_MIN_FPS:g} and {_MAX_FPS:g} Hz")
     try:
         root = None if data_root is None else expand_user(data_root)
-        return _open_by_name(os.fspath(name), root, camera, options, download, progress, skip_broken)
+        source = _open_by_name(os.fspath(name), root, camera, options, download, progress, skip_broken)
     except OSError as error:  # such as a folder without permission or a name that is too long
         raise InputError(
             f"{error.filename or name}: cannot be read ({error.strerror}); check its name and permissions"
         ) from error
+    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
+        warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)
+    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
+        warnings.warn(f"{source.name}: {source.depth_scale_note}", DepthScaleWarning, stacklevel=3)
+    return source
 
 
 def _open_by_name(
@@ -150,11 +155,3 @@ def _open_by_name(
     if isinstance(source, ImageSequence):
         source.check(path, skip_broken=skip_broken)
     return source
-
-
-def _warn(source: RGBDStream) -> None:
-    """Warn about missing ground truth and an estimated depth scale, at the line that called this module."""
-    if isinstance(source, StoredSequence) and source.groundtruth_error is not None:
-        warnings.warn(f"{source.groundtruth_error}; continuing without ground truth", GroundTruthWarning, stacklevel=3)
-    if isinstance(source, ImageSequence) and source.depth_scale_note is not None:
-        warnings.warn(f"{source.name}: {source.depth_scale_note}", DepthScaleWarning, stacklevel=3)

@@ -21,7 +21,7 @@ _NAMED_FOLDERS = 3
 
 @dataclass(frozen=True)
 class Matches:
-    """What names, paths and patterns match.
+    """Sequences and other folders that names, paths and patterns match.
 
     Attributes:
         sequences: Sequences, in the form that `load_sequence` accepts.

@@ -17,7 +17,7 @@ from v3d_torch.evaluation.outcome import Outcome, collect_metric, label_sequence
 from v3d_torch.evaluation.outcome_groups import OutcomeGroups
 from v3d_torch.evaluation.paper_tables import HEADINGS
 from v3d_torch.evaluation.summary import make_error_tables
-from v3d_torch.evaluation.tables import Cell, ErrorTable, format_lowest, format_markdown_table, format_median_and_range
+from v3d_torch.evaluation.tables import Cell, ErrorTable, format_markdown_table, format_median_and_range
 
 VARIANTS = (
     "baseline",
@@ -186,7 +186,7 @@ def _make_table(outcomes: Sequence[Outcome]) -> ErrorTable:
         medians = {variant: median(values) for variant, values in measured.items() if values}
         if medians:
             headings.append(column.heading)
-            lowest = format_lowest(medians.values(), column.form)
+            lowest = format(min(medians.values()), column.form)
             for variant, values in measured.items():
                 best = column.is_error and bool(values) and format(medians[variant], column.form) == lowest
                 rows[variant].append(Cell(format_median_and_range(values, column.form), best))

@@ -19,7 +19,6 @@ from v3d_torch.evaluation.tables import (
     Cell,
     ErrorTable,
     format_latex_document,
-    format_lowest,
     format_markdown_table,
     format_median_and_range,
     make_screen_legend,
@@ -223,7 +222,7 @@ def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:
         difference = next((result.difference for result in by_method.values() if result.difference is not None), None)
         # A part of a sequence, or another recording, is not comparable with the whole, so no value is the best.
         is_comparable = len(medians) > 1 and difference is None
-        lowest = format_lowest(medians.values(), _FORMAT) if is_comparable else None
+        lowest = format(min(medians.values()), _FORMAT) if is_comparable else None
         rows[label_sequence(sequence, difference)] = tuple(
             Cell(
                 by_method[method].text if method in by_method else "-",

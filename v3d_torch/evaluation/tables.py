@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from statistics import median
@@ -89,11 +89,6 @@ def format_median_and_range(values: Sequence[float], form: str) -> str:
         return "-"
     middle, low, high = (format(value, form) for value in (median(values), min(values), max(values)))
     return middle if low == high else f"{middle} [{low}-{high}]"
-
-
-def format_lowest(values: Iterable[float], form: str) -> str:
-    """Format the lowest of values. Values that are equal as printed can all be the best."""
-    return format(min(values), form)
 
 
 def make_screen_legend(legend: str) -> Padding:

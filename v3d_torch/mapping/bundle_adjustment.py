@@ -126,12 +126,12 @@ def bundle_adjust(
     )
     start = initial[0].detach(), initial[1].detach()
     if needs_gradient(initial[0], *problem):
-        found = _minimise(*start, *problem.detach(), iterations, tolerance)
+        found = _minimise(*start, *problem.detach(), iterations=iterations, tolerance=tolerance)
         state = problem.differentiate((found.T_cw, found.points), initial[0])
         cost_after, residuals = problem.residuals_at(state)
         found = found._replace(T_cw=state[0], points=state[1], chi2=problem.chi2(residuals), cost_after=cost_after)
     else:
-        found = _minimise(*start, *problem, iterations, tolerance)
+        found = _minimise(*start, *problem, iterations=iterations, tolerance=tolerance)
     chi2 = torch.where(valid, found.chi2, torch.inf)
     wide = working_dtype(T_cw.dtype)  # costs can exceed the range of half precision
     return BundleAdjustment(
@@ -157,47 +157,25 @@ class _Minimum(NamedTuple):
     iterations: Tensor
 
 
-def sort_by_point(
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    pose: Tensor,
-    point: Tensor,
-    fixed: Tensor,
-    point_count: int,
-) -> Iterator[tuple[NDArray[np.int64], SortedProblem]]:
+def sort_by_point(problem: BundleProblem, point_count: int) -> Iterator[tuple[NDArray[np.int64], SortedProblem]]:
     """Sort the observations of each problem of a batch by point; yield their order and the arguments of the kernels."""
-    batch = fixed.shape[:-1]
-    columns = scale, offset, thresholds, weights, pose, point, fixed
-    for row in zip(*(to_rows(each, batch) for each in columns), strict=True):
+    batch = problem.fixed.shape[:-1]
+    for row in zip(*(to_rows(column, batch) for column in problem), strict=True):
         order = np.argsort(row[5], kind="stable")
         of_points = np.searchsorted(row[5][order], np.arange(point_count + 1))
         # The last dimension is that of the observations.
         yield order, (*(each.take(order, axis=-1) for each in row[:5]), of_points, np.flatnonzero(~row[6]))
 
 
-def _minimise_compiled(
-    T_cw: Tensor,
-    points: Tensor,
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    pose: Tensor,
-    point: Tensor,
-    fixed: Tensor,
-    iterations: int,
-    tolerance: float,
-) -> _Minimum:
-    batch = fixed.shape[:-1]
+def _minimise_compiled(T_cw: Tensor, points: Tensor, *problem: Tensor, iterations: int, tolerance: float) -> _Minimum:
+    batch = T_cw.shape[:-3]
     if 0 in batch:
         return NotImplemented
     settings = iterations, tolerance, SCHUR_REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
-    problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
+    problems = sort_by_point(BundleProblem(*problem), points.shape[-2])
     results = []
-    for T, X, (order, problem) in zip(to_rows(T_cw, batch), to_rows(points, batch), problems, strict=True):
-        *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(T, X, *problem, *settings)
+    for T, X, (order, arguments) in zip(to_rows(T_cw, batch), to_rows(points, batch), problems, strict=True):
+        *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(T, X, *arguments, *settings)
         chi2 = np.empty_like(squared)
         chi2[order] = squared
         results.append((*moved, chi2, cost_before, cost_after, steps))
@@ -206,23 +184,11 @@ def _minimise_compiled(
 
 @torch.no_grad()
 @compiled_by(_minimise_compiled)
-def _minimise(
-    T_cw: Tensor,
-    points: Tensor,
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    pose: Tensor,
-    point: Tensor,
-    fixed: Tensor,
-    iterations: int,
-    tolerance: float,
-) -> _Minimum:
-    """Minimise the robust cost, without gradients."""
-    problem = BundleProblem(scale, offset, thresholds, weights, pose, point, fixed)
-    found = levenberg_marquardt((T_cw, points), problem.residuals_at, problem.step, iterations, tolerance)
-    return _Minimum(*found.state, problem.chi2(found.system), found.cost_before, found.cost_after, found.iterations)
+def _minimise(T_cw: Tensor, points: Tensor, *problem: Tensor, iterations: int, tolerance: float) -> _Minimum:
+    """Minimise the robust cost of a `BundleProblem`, without gradients."""
+    at = BundleProblem(*problem)
+    found = levenberg_marquardt((T_cw, points), at.residuals_at, at.step, iterations, tolerance)
+    return _Minimum(*found.state, at.chi2(found.system), found.cost_before, found.cost_after, found.iterations)
 
 
 class BundleAdjuster(torch.nn.Module):

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from v3d_torch.mapping.keyframe import Keyframe, Loop, stack_poses
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.runtime.tensor_table import TensorTable
 
 
-class MapTables:
+class MapTables(StatefulComponent):
     """Keyframes, landmarks and observations of a sparse map, without operations that need a camera.
 
     A landmark id is a row of ``landmarks``.
@@ -46,6 +44,8 @@ class MapTables:
         loops: Closed loops, oldest first.
         readout: Readout of the camera with which the stored features were compensated.
     """
+
+    _STATE = ("keyframes", "landmarks", "observations", "loops", "readout")
 
     def __init__(self) -> None:
         self.keyframes: list[Keyframe] = []
@@ -120,21 +120,3 @@ class MapTables:
         for keyframe in self.keyframes:
             if keyframe.part == max(a, b):
                 keyframe.part = min(a, b)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the data of the map by attribute name, as live objects."""
-        return {
-            "keyframes": self.keyframes,
-            "landmarks": self.landmarks,
-            "observations": self.observations,
-            "loops": self.loops,
-            "readout": self.readout,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the data of the map by a state of `state_dict`; the objects are shared, not copied."""
-        self.keyframes = state["keyframes"]
-        self.landmarks = state["landmarks"]
-        self.observations = state["observations"]
-        self.loops = state["loops"]
-        self.readout = state["readout"]

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_fusion import LandmarkFusion
 from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.types import FramePose, RGBDFrame, TrackingStatus
 
 _MIN_KEYFRAME_INTERVAL = 4
@@ -18,7 +16,7 @@ _MIN_KEYFRAME_INTERVAL = 4
 never shows ``mapping.min_tracked`` landmarks, every frame would become a keyframe."""
 
 
-class Mapper:
+class Mapper(StatefulComponent):
     """Decides when a frame becomes a keyframe, and inserts the keyframe into the map.
 
     Args:
@@ -29,6 +27,8 @@ class Mapper:
     Attributes:
         map: The map.
     """
+
+    _STATE = ("_most_tracked", "_untracked_since", "_frames_since_keyframe", "_last_index")
 
     def __init__(self, config: Config, camera: PinholeCamera, sparse_map: SparseMap) -> None:
         self._config = config
@@ -63,21 +63,6 @@ class Mapper:
         self._most_tracked, self._untracked_since, self._frames_since_keyframe = 0, None, 0
         self._fuse_landmarks(self.map, keyframe)
         return keyframe
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state of the keyframe decision; the map has its own state."""
-        return {
-            "most_tracked": self._most_tracked,
-            "untracked_since": self._untracked_since,
-            "frames_since_keyframe": self._frames_since_keyframe,
-            "last_index": self._last_index,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self._most_tracked = state["most_tracked"]
-        self._untracked_since = state["untracked_since"]
-        self._frames_since_keyframe, self._last_index = state["frames_since_keyframe"], state["last_index"]
 
     def _needs_keyframe(self, frame: RGBDFrame, features: Features, pose: FramePose) -> bool:
         """Decide whether the map needs a keyframe, and update the counters of this decision."""

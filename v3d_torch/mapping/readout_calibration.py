@@ -104,7 +104,7 @@ def estimate_readout(
     sigma = fill_padding(pixel_sigma, valid, 1.0)[..., None] if isinstance(pixel_sigma, Tensor) else pixel_sigma
     derivative = -fill_padding(readout_jacobian, valid[..., None], 0.0) / sigma
     by_readout = torch.cat([derivative, torch.zeros_like(derivative[..., :1])], dim=-1).mT.expand_as(problem.scale)
-    slope, curvature = reduced_cost_derivatives(*state, *problem, by_readout)
+    slope, curvature = reduced_cost_derivatives(*state, by_readout, *problem)
     unadjusted = 2 * (problem.weights[..., None, :] * by_readout.square()).sum(dim=(-2, -1))
     old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
     old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
@@ -139,26 +139,17 @@ def combine_readouts(
 
 
 def _reduced_cost_derivatives_compiled(
-    T_cw: Tensor,
-    points: Tensor,
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    pose: Tensor,
-    point: Tensor,
-    fixed: Tensor,
-    derivative: Tensor,
+    T_cw: Tensor, points: Tensor, derivative: Tensor, *problem: Tensor
 ) -> tuple[Tensor, Tensor]:
-    batch = fixed.shape[:-1]
+    batch = T_cw.shape[:-3]
     if 0 in batch:
         return NotImplemented
-    problems = sort_by_point(scale, offset, thresholds, weights, pose, point, fixed, points.shape[-2])
+    problems = sort_by_point(BundleProblem(*problem), points.shape[-2])
     poses, landmarks, derivatives = to_rows(T_cw, batch), to_rows(points, batch), to_rows(derivative.mT, batch)
     settings = NEGLIGIBLE_DAMPING, SCHUR_REGULARISATION, MIN_DEPTH
     results = [
-        kernels.reduced_cost_derivatives(T, X, *problem, j[order], *settings)
-        for T, X, j, (order, problem) in zip(poses, landmarks, derivatives, problems, strict=True)
+        kernels.reduced_cost_derivatives(T, X, *arguments, j[order], *settings)
+        for T, X, j, (order, arguments) in zip(poses, landmarks, derivatives, problems, strict=True)
     ]
     slope, curvature = from_rows(results, batch)
     return slope, curvature
@@ -166,16 +157,7 @@ def _reduced_cost_derivatives_compiled(
 
 @compiled_by(_reduced_cost_derivatives_compiled)
 def reduced_cost_derivatives(
-    T_cw: Tensor,
-    points: Tensor,
-    scale: Tensor,
-    offset: Tensor,
-    thresholds: Tensor,
-    weights: Tensor,
-    pose: Tensor,
-    point: Tensor,
-    fixed: Tensor,
-    derivative: Tensor,
+    T_cw: Tensor, points: Tensor, derivative: Tensor, *problem: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the minimum cost of a bundle adjustment with respect to a parameter of the measurements.
 
@@ -184,21 +166,15 @@ def reduced_cost_derivatives(
     Args:
         T_cw: Poses at the minimum, float64, shape :math:`(..., P, 4, 4)`.
         points: Landmarks at the minimum, float64, shape :math:`(..., L, 3)`.
-        scale: See `BundleProblem`, also for the arguments that follow.
-        offset: Shape :math:`(..., 3, M)`.
-        thresholds: Shape :math:`(..., M)`.
-        weights: Shape :math:`(..., M)`.
-        pose: Shape :math:`(..., M)`.
-        point: Shape :math:`(..., M)`.
-        fixed: Shape :math:`(..., P)`.
         derivative: Derivative :math:`j` of the whitened residuals, shape :math:`(..., 3, M)`.
+        problem: Columns of the `BundleProblem`.
 
     Returns:
         First and second derivative of the minimum cost, shape :math:`(...)` each.
     """
-    problem = BundleProblem(scale, offset, thresholds, weights, pose, point, fixed)
-    _, residuals = problem.residuals_at((T_cw, points))
-    weighted = 2 * residuals.weights[..., None, :] * problem.remaining(residuals, derivative, points.shape[-2])
+    at = BundleProblem(*problem)
+    _, residuals = at.residuals_at((T_cw, points))
+    weighted = 2 * residuals.weights[..., None, :] * at.remaining(residuals, derivative, points.shape[-2])
     return (weighted * residuals.whitened).sum(dim=(-2, -1)), (weighted * derivative).sum(dim=(-2, -1))
 
 

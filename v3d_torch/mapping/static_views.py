@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +13,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.runtime.stateful import StatefulComponent
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class StaticView:
         return self.depth_units.to(torch.float32) * STORED_UNIT
 
 
-class StaticViews:
+class StaticViews(StatefulComponent):
     """Static views of keyframes, as images of a pinhole camera of lower resolution without distortion.
 
     The images are undistorted once, here; dense reconstruction then uses the pinhole projection alone. Iteration,
@@ -68,6 +68,8 @@ class StaticViews:
         rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a pixel is the exact ray of the
             pixel of the frame from which it was sampled.
     """
+
+    _STATE = ("_views",)
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
         self.stride = stride
@@ -138,11 +140,3 @@ class StaticViews:
             view: View of this camera.
         """
         self._views = [*self, view]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the views, as live objects."""
-        return {"views": self._views}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the views by a state of `state_dict` of views with the same camera and stride."""
-        self._views = state["views"]

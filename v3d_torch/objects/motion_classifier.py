@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from math import isnan
 from typing import Any
@@ -32,6 +32,7 @@ from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.track import Track
 from v3d_torch.objects.visible_masks import visible_masks
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
 from v3d_torch.types import STAMP_TOLERANCE, Instances
 
@@ -48,7 +49,7 @@ _MIN_SUPPORTED_TIME = 0.3
 person fit it too, if the person walks slowly or along the line of sight."""
 
 
-class MotionClassifier:
+class MotionClassifier(StatefulComponent):
     """Object stage of a frame: ids, motion states and the static mask.
 
     Args:
@@ -59,6 +60,8 @@ class MotionClassifier:
         tracker: Tracks of the objects.
         static_surfaces: Static surfaces of earlier views, to which each view is added once its pose is known.
     """
+
+    _STATE = ("_last_stamp", "tracker", "static_surfaces")
 
     def __init__(self, config: ObjectsConfig, camera: PinholeCamera) -> None:
         self._config = config
@@ -176,21 +179,6 @@ class MotionClassifier:
             view: Depth and pose of the frame.
         """
         return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state between frames: timestamp of the last frame, tracks and earlier views."""
-        parts = {"tracker": self.tracker.state_dict(), "static_surfaces": self.static_surfaces.state_dict()}
-        return {"last_stamp": self._last_stamp, **parts}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the state between frames.
-
-        Args:
-            state: Result of `state_dict`.
-        """
-        self._last_stamp = state["last_stamp"]
-        self.tracker.load_state_dict(state["tracker"])
-        self.static_surfaces.load_state_dict(state["static_surfaces"])
 
     def _refined_masks(
         self, tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied

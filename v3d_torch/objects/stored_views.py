@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.depth_view import StoredView
+from v3d_torch.runtime.stateful import StatefulComponent
 
 
-class StoredViews:
+class StoredViews(StatefulComponent):
     """Base class of a comparison with earlier views; it stores them, oldest first."""
+
+    _STATE = ("_views",)
 
     def __init__(self) -> None:
         self._views: list[StoredView] = []
@@ -33,15 +34,3 @@ class StoredViews:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
         self._views = [replace(view, T_dw=view.T_dw @ invert(T_new_old)) for view in self._views]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the stored views."""
-        return {"views": list(self._views)}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Replace the stored views.
-
-        Args:
-            state: Result of `state_dict`.
-        """
-        self._views = list(state["views"])

@@ -77,13 +77,13 @@ def are_balls_free(blocks: VoxelBlocks, points: Tensor, radius: float, size: flo
     steps = torch.arange(-reach, reach + 1)
     offsets = torch.cartesian_prod(steps, steps, steps)
     free = torch.ones(len(points), dtype=torch.bool)
-    for part in torch.arange(len(points)).split(max(_BATCH // len(offsets), 1)):
-        voxels = (points[part] / size).floor().to(torch.int64)[:, None] + offsets
-        touched = cube_gap(points[part, None], voxels, size) <= radius
+    for rows in torch.arange(len(points)).split(max(_BATCH // len(offsets), 1)):
+        voxels = (points[rows] / size).floor().to(torch.int64)[:, None] + offsets
+        touched = cube_gap(points[rows, None], voxels, size) <= radius
         log_odds = blocks.log_odds_at(voxels[touched])
         blocked = torch.zeros_like(touched)
         blocked[touched] = (log_odds >= 0) | (log_odds == UNKNOWN)
-        free[part] = ~blocked.any(dim=1)
+        free[rows] = ~blocked.any(dim=1)
     return free
 
 

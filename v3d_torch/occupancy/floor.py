@@ -32,8 +32,8 @@ _FACING_TOLERANCE = math.radians(30)
 _MIN_VOXELS = 30
 """Minimum number of voxels for a direction or a plane."""
 
-_MAX_LEVELS = 6
-"""Maximum number of levels of horizontal surfaces: floor, tables, shelves."""
+_MAX_LAYERS = 6
+"""Maximum number of layers with horizontal surfaces: floor, tables, shelves."""
 
 _MIN_AREA = 0.25
 """Minimum visible area of a floor, square metres; steps and boxes are smaller."""
@@ -83,9 +83,9 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
     """Find the floor of a map.
 
     The up direction is the normal with which most other normals agree: the normals of floor, tables and ceiling are
-    parallel. Then the levels with the most voxels that face up are found, and parallel planes are fitted to the
-    connected surfaces of all levels, because often only a small part of the floor is visible. The floor is the lowest
-    level that is large enough and has few occupied voxels below it. All voxels are hypotheses, so the result is
+    parallel. Then the layers with the most voxels that face up are found, and parallel planes are fitted to the
+    connected surfaces of all layers, because often only a small part of the floor is visible. The floor is the lowest
+    layer that is large enough and has few occupied voxels below it. All voxels are hypotheses, so the result is
     deterministic.
 
     Args:
@@ -104,12 +104,12 @@ def find_floor(occupancy: OccupancyMap, up: UpDirection) -> Floor | None:
         return None
     facing = points[normals @ direction > math.cos(_FACING_TOLERANCE)]
     for _ in range(_REFINEMENTS):
-        levels = _find_levels(facing @ direction, size)
-        surfaces = [surface for level in levels for surface in _split(facing[level], _MAX_GAP * size * math.sqrt(step))]
+        layers = _find_layers(facing @ direction, size)
+        surfaces = [surface for layer in layers for surface in _split(facing[layer], _MAX_GAP * size * math.sqrt(step))]
         direction = _fit_normal(surfaces, size, direction)
     if direction @ up.direction < math.cos(up.tolerance):
         return None
-    return _lowest_level(facing @ direction, points @ direction, direction, size, step * size**2)
+    return _lowest_layer(facing @ direction, points @ direction, direction, size, step * size**2)
 
 
 def _voxel_normals(occupancy: OccupancyMap, points: Tensor) -> Tensor:
@@ -135,24 +135,24 @@ def _common_direction(normals: Tensor, up: UpDirection) -> Tensor | None:
     return direction
 
 
-def _find_levels(heights: Tensor, size: float) -> list[Tensor]:
-    """Masks of the points at each level, (N,) each, sorted by number of points; a level is two voxels high."""
-    free, levels = torch.ones_like(heights, dtype=torch.bool), []
-    for _ in range(_MAX_LEVELS):
+def _find_layers(heights: Tensor, size: float) -> list[Tensor]:
+    """Masks of the points of each layer, (N,) each, sorted by number of points; a layer is two voxels high."""
+    free, layers = torch.ones_like(heights, dtype=torch.bool), []
+    for _ in range(_MAX_LAYERS):
         own = heights[free].sort().values
         counts = _count_near(own, own, size)
         if len(own) == 0 or int(counts.max()) < _MIN_VOXELS:
             break
-        level = free & ((heights - own[int(counts.argmax())]).abs() <= size)
-        levels.append(level)
-        free = free & ~level
-    return levels
+        layer = free & ((heights - own[int(counts.argmax())]).abs() <= size)
+        layers.append(layer)
+        free = free & ~layer
+    return layers
 
 
-def _split(level: Tensor, gap: float) -> list[Tensor]:
-    """Split the points (N, 3) of a level into connected surfaces, (M, 3) each: tables can differ by a voxel."""
-    labels = dbscan(level[None], torch.ones(1, len(level), dtype=torch.bool), gap, min_samples=1)[0]
-    surfaces = [level[labels == label] for label in labels.unique()]
+def _split(layer: Tensor, gap: float) -> list[Tensor]:
+    """Split the points (N, 3) of a layer into connected surfaces, (M, 3) each: tables can differ by a voxel."""
+    labels = dbscan(layer[None], torch.ones(1, len(layer), dtype=torch.bool), gap, min_samples=1)[0]
+    surfaces = [layer[labels == label] for label in labels.unique()]
     return [surface for surface in surfaces if len(surface) >= _MIN_VOXELS]
 
 
@@ -166,8 +166,8 @@ def _fit_normal(surfaces: list[Tensor], size: float, direction: Tensor) -> Tenso
     return normal * (normal @ direction).sign() if surfaces else direction
 
 
-def _lowest_level(heights: Tensor, occupied: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
-    """Lowest level with enough voxels that face up and few occupied voxels below it.
+def _lowest_layer(heights: Tensor, occupied: Tensor, up: Tensor, size: float, area: float) -> Floor | None:
+    """Lowest layer with enough voxels that face up and few occupied voxels below it.
 
     Args:
         heights: Heights of the voxels that face up, (N,).

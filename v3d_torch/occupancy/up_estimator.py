@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from torch import Tensor
 
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
+from v3d_torch.runtime.stateful import StatefulComponent
 
 
-class UpEstimator:
+class UpEstimator(StatefulComponent):
     """Collects the measurements of the up direction: measured gravity, and votes of the segmentation.
 
     Attributes:
@@ -20,6 +18,8 @@ class UpEstimator:
             None before.
         votes: Sum of the votes of the segmentation, see `up_votes`; None if there are none.
     """
+
+    _STATE = ("gravity", "votes")
 
     def __init__(self) -> None:
         self.gravity: Tensor | None = None
@@ -65,11 +65,3 @@ class UpEstimator:
             Transform, float64, shape :math:`(4, 4)`, see `level_frame`.
         """
         return None if floor is None and self.gravity is None else level_frame(self.up(floor))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return gravity and votes."""
-        return dict(vars(self))
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self.gravity, self.votes = state["gravity"], state["votes"]

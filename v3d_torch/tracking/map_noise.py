@@ -8,15 +8,16 @@ map grows as the camera explores, and shrinks when it observes old landmarks aga
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
+from v3d_torch.runtime.stateful import StatefulComponent
 
-class MapNoise:
+
+class MapNoise(StatefulComponent):
     """Covariance of the pose errors of the active keyframes, relative to the variance of a frame."""
+
+    _STATE = ("_rows", "_covariance")
 
     def __init__(self) -> None:
         self._rows = torch.zeros(0, dtype=torch.int64)  # row of the covariance, for each keyframe
@@ -50,14 +51,6 @@ class MapNoise:
         active, self._rows = references.unique(return_inverse=True)
         kept = rows[active]
         self._covariance = grown[kept][:, kept]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the covariance and the rows of the keyframes."""
-        return {"rows": self._rows, "covariance": self._covariance}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self._rows, self._covariance = state["rows"], state["covariance"]
 
     def _add_unrelated(self, count: int) -> None:
         """Add the keyframes of a loaded map, with independent errors, until there are ``count`` keyframes."""

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.tracking.pose_history import PoseHistory
 from v3d_torch.types import MIN_INTERVAL, FramePose, TrackingStatus
 
@@ -47,12 +46,14 @@ class PosePrediction:
         return self.motion_until(stamp) @ self.T_cw
 
 
-class MotionModel:
+class MotionModel(StatefulComponent):
     """Estimates how static points move in the camera frame, from the poses of the frames.
 
     Attributes:
         velocity: Twist of static points in the camera frame after the last frame, as in `PosePrediction`.
     """
+
+    _STATE = ("velocity",)
 
     def __init__(self) -> None:
         self.velocity = torch.zeros(6, dtype=torch.float64)
@@ -93,11 +94,3 @@ class MotionModel:
             self.velocity = motion.velocity if motion.is_measured else last
         elif poses.status is not TrackingStatus.LOST and elapsed > 0:
             self.velocity = se3_log(pose.T_cw @ invert(poses.T_cw)) / max(elapsed, MIN_INTERVAL)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the velocity."""
-        return {"velocity": self.velocity}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the velocity of `state_dict`."""
-        self.velocity = state["velocity"]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -11,19 +10,22 @@ from torch import Tensor
 from v3d_torch.geometry.se3 import interpolate, invert, orthonormalise
 from v3d_torch.mapping.keyframe import Keyframe, stack_poses
 from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.runtime.tensor_table import TensorTable
 from v3d_torch.types import FramePose, TrackingStatus, Trajectory
 
 _STATUSES = tuple(TrackingStatus)
 
 
-class PoseHistory:
+class PoseHistory(StatefulComponent):
     """Poses of all frames in the order of time.
 
     Attributes:
         last_found: Time of the last frame that was found, seconds; minus infinity if there is none.
         observed_landmarks: Ids of the landmarks of the last frame that observed landmarks, int64, shape :math:`(L,)`.
     """
+
+    _STATE = ("_frames", "_keyframes", "last_found", "observed_landmarks", "_place")
 
     def __init__(self) -> None:
         self._frames = TensorTable(
@@ -161,22 +163,6 @@ class PoseHistory:
         T_cw = frames["T_ck"] @ self._keyframe_poses()[frames["keyframe"]]
         found = frames["status"] != _STATUSES.index(TrackingStatus.LOST)
         return Trajectory(frames["stamp"].clone(), invert(_interpolate(frames["stamp"], T_cw, found)))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the poses of all frames."""
-        return {
-            "frames": self._frames,
-            "keyframes": self._keyframes,
-            "last_found": self.last_found,
-            "observed_landmarks": self.observed_landmarks,
-            "place": self._place,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the poses of `state_dict`."""
-        self._frames, self._keyframes = state["frames"], state["keyframes"]
-        self.last_found = state["last_found"]
-        self.observed_landmarks, self._place = state["observed_landmarks"], state["place"]
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""

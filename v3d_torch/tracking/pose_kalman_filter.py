@@ -7,14 +7,13 @@ theory for state estimation in robotics, 2018, Sec. V).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise, se3_exp, se3_log
+from v3d_torch.runtime.stateful import StatefulComponent
 
 _SPEED_SIGMA, _RATE_SIGMA = 1.0, 2.0
 """Standard deviation of an unknown velocity, m/s and rad/s, and of the change of the velocity in one second: a handheld
@@ -23,7 +22,7 @@ camera can stop or reverse within a second. A robot is slower; its covariances a
 _TWIST_COVARIANCE = torch.tensor([_SPEED_SIGMA] * 3 + [_RATE_SIGMA] * 3, dtype=torch.float64).square().diag()
 
 
-class PoseKalmanFilter:
+class PoseKalmanFilter(StatefulComponent):
     """Kalman filter of pose and twist of the camera. Call `start` before any other method.
 
     Attributes:
@@ -32,6 +31,8 @@ class PoseKalmanFilter:
         twist: Filtered twist in the camera frame, m/s and rad/s, float64, shape :math:`(6,)`.
         covariance: Covariance of the errors of pose and twist, float64, shape :math:`(12, 12)`.
     """
+
+    _STATE = ("stamp", "T_wc", "twist", "covariance")
 
     def __init__(self) -> None:
         self.start(math.nan, torch.eye(4, dtype=torch.float64), torch.zeros(6, 6, dtype=torch.float64))
@@ -90,14 +91,6 @@ class PoseKalmanFilter:
         """Set the twist to zero, and add its former value to the uncertainty."""
         self.covariance = self.covariance + torch.block_diag(torch.zeros(6, 6), self.twist.outer(self.twist))
         self.twist = torch.zeros_like(self.twist)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return all attributes."""
-        return dict(vars(self))
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        vars(self).update(state)
 
 
 def join_covariances(covariance: Tensor, cross_covariance: Tensor, twist_covariance: Tensor) -> Tensor:

@@ -10,14 +10,14 @@ the motion changes within a few frames (difference-based variance estimation; Ha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.runtime.stateful import StatefulComponent
 
 _WINDOW = 5
 """Number of consecutive poses, of which the middle one is compared with the interpolation of the others."""
@@ -39,8 +39,10 @@ _MIN_RATIO = 1.0
 """Minimum ratio: the errors of a camera at rest are constant, so that its poses seem to have no noise."""
 
 
-class PoseNoise:
+class PoseNoise(StatefulComponent):
     """Ratio of actual to nominal covariance of poses, as a matrix in coordinates whitened by the nominal covariance."""
+
+    _STATE = ("_window", "_sum", "_weight")
 
     def __init__(self) -> None:
         self._window: list[tuple[float, Tensor, Tensor]] = []  # stamp, T_wc, nominal covariance
@@ -85,14 +87,6 @@ class PoseNoise:
         whole = torch.linalg.cholesky(covariance) @ axes
         roots = [whole * (variance * ratios).clamp(min=_MIN_RATIO).sqrt() for variance in variances]
         return [root @ root.T for root in roots]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the last poses and the average."""
-        return {"window": self._window, "sum": self._sum, "weight": self._weight}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self._window, self._sum, self._weight = state["window"], state["sum"], state["weight"]
 
 
 def _interpolation_weights(stamps: Sequence[float]) -> Tensor:

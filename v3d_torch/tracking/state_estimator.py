@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import adjoint, invert
 from v3d_torch.odometry.odometry import CameraMotion
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.map_noise import MapNoise
 from v3d_torch.tracking.motion_model import MAX_EXTRAPOLATION
@@ -39,7 +37,7 @@ _LOST_FOR_A_SECOND = _covariance(1.0, 1.0)
 be wherever it could move at walking speed."""
 
 
-class StateEstimator:
+class StateEstimator(StatefulComponent):
     """Estimates the state of the camera at each frame.
 
     The covariance of a pose that was tracked in the map is the sum of the noise of the frame (`PoseNoise`) and of the
@@ -47,6 +45,19 @@ class StateEstimator:
     previous covariance; a lost camera adds `_LOST_FOR_A_SECOND`, because it may have jumped. Without a measured motion,
     the covariance grows with the uncertainty of the twist (`PoseKalmanFilter`).
     """
+
+    _STATE = (
+        "_pose_noise",
+        "_map_noise",
+        "_filter",
+        "_frame_noise",
+        "_owners",
+        "_covariance",
+        "_known_covariance",
+        "_last_measured",
+        "_last_found",
+        "_part_covariance_w",
+    )
 
     def __init__(self) -> None:
         self._pose_noise = PoseNoise()
@@ -118,31 +129,6 @@ class StateEstimator:
         self._pose_noise.interrupt()
         self._filter.T_wc = T_new_old @ self._filter.T_wc
         self._part_covariance_w = _transform(self._part_covariance_w, T_new_old)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state that changes from frame to frame."""
-        return {
-            "pose_noise": self._pose_noise.state_dict(),
-            "map_noise": self._map_noise.state_dict(),
-            "filter": self._filter.state_dict(),
-            "frame_noise": self._frame_noise,
-            "owners": self._owners,
-            "covariance": self._covariance,
-            "known_covariance": self._known_covariance,
-            "last_measured": self._last_measured,
-            "last_found": self._last_found,
-            "part_covariance_w": self._part_covariance_w,
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self._pose_noise.load_state_dict(state["pose_noise"])
-        self._map_noise.load_state_dict(state["map_noise"])
-        self._filter.load_state_dict(state["filter"])
-        self._frame_noise, self._owners = state["frame_noise"], state["owners"]
-        self._covariance, self._known_covariance = state["covariance"], state["known_covariance"]
-        self._last_measured, self._last_found = state["last_measured"], state["last_found"]
-        self._part_covariance_w = state["part_covariance_w"]
 
     def _track(self, information: Tensor, stamp: float, T_wc: Tensor, owners: Tensor) -> Tensor:
         """Covariance of a pose that was tracked in the map."""
