@@ -8,7 +8,7 @@ measurement"; timestamps are in seconds.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -306,23 +306,37 @@ class Trajectory:
     def __len__(self) -> int:
         return self.stamps.shape[0]
 
-    def poses_at(self, stamps: Tensor) -> Tensor:
+    def poses_at(self, stamps: Tensor | Sequence[float]) -> Tensor:
         """Return the poses at given times, interpolated between the nearest poses before and after.
 
         Args:
-            stamps: Timestamps, seconds, float64, shape :math:`(K,)`; before the first pose and after the last one, the
-                camera is at rest.
+            stamps: Timestamps, seconds, float64, shape :math:`(K,)`; arrays and lists are accepted. Before the first
+                pose and after the last one, the camera is at rest.
 
         Returns:
             Camera-to-world poses, float64, shape :math:`(K, 4, 4)`.
 
         Raises:
-            InputError: If the trajectory has no poses.
+            InputError: If the trajectory has no poses, or if the stamps are not numbers, or less precise than float64.
         """
         if len(self) == 0:
             raise InputError("the trajectory has no poses to interpolate; give one with at least one pose")
+        stamps = _to_times(stamps)
         before = (torch.searchsorted(self.stamps, stamps, right=True) - 1).clamp(min=0)
         after = (before + 1).clamp(max=len(self) - 1)
         span = (self.stamps[after] - self.stamps[before]).clamp(min=torch.finfo(torch.float64).tiny)  # 0 at the end
         fraction = ((stamps - self.stamps[before]) / span).clamp(0, 1)
         return interpolate(self.T_wc[before], self.T_wc[after], fraction)
+
+
+def _to_times(stamps: Tensor | Sequence[float]) -> Tensor:
+    """Return times as float64; those of a tensor or array of lower precision are rounded, and so of another time."""
+    try:
+        times = stamps if isinstance(stamps, Tensor) else torch.from_numpy(np.asarray(stamps))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"stamps are not numbers ({error}); give an array or tensor") from error
+    if times.is_floating_point() and times.dtype != torch.float64:
+        raise InputError(
+            f"stamps have the type {times.dtype}; give torch.float64, because float32 rounds Unix times to two minutes"
+        )
+    return times.to(torch.float64)

@@ -255,6 +255,15 @@ def test_index_out_of_range_is_rejected(index: int) -> None:
         optimise_pose_graph(graph.start, graph.edges.to(torch.int32), graph.T_ij)
 
 
+def test_edge_from_a_pose_to_itself_is_rejected() -> None:
+    graph = Graph(poses=6, loops=2)
+    edges, valid = graph.edges.clone(), torch.arange(len(graph.edges)) != 3
+    edges[3] = 2
+    with pytest.raises(InputError, match=r"^edges joins pose 2 to itself; give edges between two different poses$"):
+        optimise_pose_graph(graph.start, edges, graph.T_ij)
+    optimise_pose_graph(graph.start, edges, graph.T_ij, valid=valid)  # padding can be any edge
+
+
 @pytest.mark.parametrize(
     ("name", "shape"),
     [

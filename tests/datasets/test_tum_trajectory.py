@@ -191,6 +191,43 @@ def test_poses_of_an_empty_trajectory_are_an_input_error() -> None:
         empty.poses_at(torch.ones(2, dtype=torch.float64))
 
 
+def test_poses_at_times_as_list_array_and_tensor_are_equal() -> None:
+    trajectory = random_trajectory(5, seed=0)
+    stamps = trajectory.stamps[1:4] + 0.01
+    expected = trajectory.poses_at(stamps)
+    for same in (stamps.numpy(), stamps.tolist(), tuple(stamps.tolist())):
+        assert torch.equal(trajectory.poses_at(same), expected)
+    assert trajectory.poses_at([]).shape == (0, 4, 4)
+    assert torch.equal(trajectory.poses_at([1305031099]), trajectory.poses_at(torch.tensor([1305031099])))
+
+
+@pytest.mark.parametrize(
+    ("stamps", "message"),
+    [
+        (torch.tensor([1305031098.7]), r"stamps have the type torch\.float32; give torch\.float64, because float32"),
+        (np.array([1305031098.7], dtype=np.float32), r"stamps have the type torch\.float32; give torch\.float64"),
+        (["now"], "stamps are not numbers"),
+        ([[1.0], [1.0, 2.0]], "stamps are not numbers"),
+    ],
+)
+def test_times_of_another_type_are_an_input_error(stamps: object, message: str) -> None:
+    """In float32, the pose was that of a time up to a minute away."""
+    with pytest.raises(InputError, match=f"^{message}"):
+        random_trajectory(5, seed=0).poses_at(stamps)
+
+
+def test_times_less_than_a_microsecond_apart_are_not_lost_without_a_word(tmp_path: Path) -> None:
+    """Both poses had the same time in the file, of which the reader used one."""
+    T_wc = random_trajectory(3, seed=0).T_wc
+    with pytest.raises(
+        InputError, match=r"out\.txt: poses 1 and 2 both have the time 0\.100000 s, rounded to 6 decimals;"
+    ):
+        write_trajectory(tmp_path / "out.txt", Trajectory([0.0, 0.1, 0.1 + 3e-7], T_wc))
+    read = read_trajectory(write(tmp_path, "0.1000003 2 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"))
+    assert read.stamps.tolist() == [0.1000003] and read.T_wc[0, 0, 3] == 2
+    write_trajectory(tmp_path / "again.txt", read)
+
+
 def test_invalid_trajectory_is_not_written(tmp_path: Path) -> None:
     path, good = tmp_path / "out.txt", random_trajectory(2, 0)
     with pytest.raises(InputError, match=r"^write_trajectory: expected a Trajectory, got .*Path"):

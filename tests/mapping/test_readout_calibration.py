@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.mapping.readout_calibration import combine_readouts, estimate_readout
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
@@ -77,6 +78,13 @@ def test_change_that_a_pose_explains_keeps_the_estimate(noise: float) -> None:
     assert (float(seconds), float(information)) == (0.02, 1e4)
     uv_jacobian[::2] = 0
     assert estimate_readout(0.02, 1e4, *state, **scene.observations)[1] > 1e4
+
+
+@pytest.mark.parametrize("information", [-1.0, torch.nan, torch.tensor([1.0, -1.0])])
+def test_information_that_is_negative_or_nan_is_rejected(information: float | torch.Tensor) -> None:
+    scene = Scene(poses=4, points=40, observers=3)
+    with pytest.raises(InputError, match=r"^information has a value that is negative or NaN; give inverse variances"):
+        estimate_readout(0.02, information, torch.ones(120, 2), scene.T_cw, scene.points, **scene.observations)
 
 
 @pytest.mark.parametrize("shape", [(1, 2), (2,), (40, 2), (120, 1)])

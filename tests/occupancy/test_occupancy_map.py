@@ -208,6 +208,13 @@ def test_mask_of_static_pixels_of_another_type_is_rejected() -> None:
         OccupancyMap(CONFIG).integrate(torch.ones(2, 3), torch.ones(2, 3).to(torch.uint8), CAMERA.rays[:2, :3], EYE)
 
 
+@pytest.mark.parametrize("size", [(0, 3), (2, 0)])
+def test_image_without_pixels_is_an_input_error(size: tuple[int, int]) -> None:
+    static, rays = torch.ones(size, dtype=torch.bool), torch.ones(*size, 3)
+    with pytest.raises(InputError, match=r"^the depth image has shape \(\d, \d\); give an image with pixels$"):
+        OccupancyMap(CONFIG).integrate(torch.ones(size), static, rays, EYE)
+
+
 @pytest.mark.parametrize("radius", [-0.1, torch.nan, torch.inf])
 def test_radius_that_is_negative_or_not_finite_is_an_input_error(radius: float, room: OccupancyMap) -> None:
     with pytest.raises(InputError, match=rf"the radius of balls is {radius} m; give a finite radius of at least 0"):

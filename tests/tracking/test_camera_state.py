@@ -61,6 +61,12 @@ def test_prediction_of_an_earlier_time_is_an_input_error(stamp: float) -> None:
         state(1.0).predict(stamp)
 
 
+def test_prediction_of_an_infinite_time_is_an_input_error() -> None:
+    """Its covariance was NaN."""
+    with pytest.raises(InputError, match=r"^no prediction for inf s: the time is not finite; give seconds$"):
+        state(1.0).predict(math.inf)
+
+
 def test_covariance_of_a_prediction_grows_with_time() -> None:
     now = state(0.0)
     torch.testing.assert_close(now.predict(0.0).covariance, now.covariance)

@@ -15,12 +15,13 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
 from v3d_torch.kernels import pose_graph as kernels
-from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.kernels.compiler import can_read, compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
@@ -106,8 +107,8 @@ def optimise_pose_graph(
         Poses without a path of edges to a fixed pose are determined only relative to each other.
 
     Raises:
-        InputError: If ``edges`` is not int64, or has an index out of range, if a mask is not bool, if a pose or an
-            information matrix is not finite, or if a weight is negative, infinite or NaN.
+        InputError: If ``edges`` is not int64, has an index out of range or joins a pose to itself, if a mask is not
+            bool, if a pose or an information matrix is not finite, or if a weight is negative, infinite or NaN.
         ConfigError: If ``robust`` is not positive.
     """
     check_masks(fixed=fixed, valid=valid)
@@ -124,7 +125,16 @@ def optimise_pose_graph(
     for column in (weights, valid):
         if column is not None:
             KORNIA_CHECK_SHAPE(column, ["*", str(measured.shape[-3])])
-    graph, start = _prepare(initial, edges, measured, information, fixed, weights, valid, robust)
+    batch = common_batch(
+        T_wc=(initial, 3),
+        edges=(edges, 2),
+        T_ij=(measured, 3),
+        information=(information, 3),
+        fixed=(fixed, 1),
+        weights=(weights, 1),
+        valid=(valid, 1),
+    )
+    graph, start = _prepare(batch, initial, edges, measured, information, fixed, weights, valid, robust)
     with torch.no_grad():
         found = _minimise(start.detach(), *graph.detach(), iterations=iterations, tolerance=tolerance)
     cost_after, steps = found.cost_after, None
@@ -237,6 +247,7 @@ def _minimise(T_wc: Tensor, *graph: Tensor, iterations: int, tolerance: float) -
 
 
 def _prepare(
+    batch: torch.Size,
     T_wc: Tensor,
     edges: Tensor,
     T_ij: Tensor,
@@ -259,19 +270,18 @@ def _prepare(
         check_weights(weights, mask_or_all(valid, weights))
     T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
     edges = fill_indices("edges", edges, T_wc.shape[-3], None if valid is None else valid[..., None])
+    if can_read(edges):
+        is_loop = edges[..., 0] == edges[..., 1]
+        if valid is not None:
+            is_loop = is_loop & valid
+        if bool(is_loop.any()):
+            pose = int(edges[..., 0].expand(is_loop.shape)[is_loop][0])
+            raise InputError(f"edges joins pose {pose} to itself; give edges between two different poses")
     if valid is not None:
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
     check_finite_arguments(T_wc=T_wc, T_ij=T_ij, information=information)
     weights = fill_padding(weights, valid, 0.0)
-    batch = common_batch(
-        T_wc.shape[:-3],
-        edges.shape[:-2],
-        T_ij.shape[:-3],
-        information.shape[:-3],
-        weights.shape[:-1],
-        fixed.shape[:-1],
-    )
     graph = _Graph(
         edges=edges.expand(*batch, count, 2),
         T_ji=invert(T_ij).expand(*batch, count, 4, 4),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.text_file import numbered_lines, replace_odd_spaces
-from v3d_torch.io.timestamps import parse_timestamp
+from v3d_torch.io.timestamps import parse_timestamp, round_timestamp
 from v3d_torch.types import Trajectory
 
 MAX_DISTANCE = 1e7
@@ -33,8 +34,8 @@ def read_trajectory(path: StrPath) -> Trajectory:
     """Read a trajectory in TUM format.
 
     Comments (#), blank lines, a byte order mark, all line endings and commas between the columns are accepted.
-    Quaternions are normalised and poses are sorted by timestamp. If a timestamp occurs more than once, the first line
-    is used.
+    Quaternions are normalised and poses are sorted by timestamp. If a timestamp, rounded to 6 decimals, occurs more
+    than once, the first line is used.
 
     Args:
         path: Path of a file with lines of ``timestamp tx ty tz qx qy qz qw``: seconds, metres, and a quaternion with
@@ -59,11 +60,11 @@ def read_trajectory(path: StrPath) -> Trajectory:
     ):
         if invalid.any():
             raise InputError(f"{path}: line {line_numbers[invalid.argmax()]} has {cause}; correct or remove it")
-    stamps, order = np.unique(poses[:, 0], return_index=True)
-    T_wc = torch.eye(4, dtype=torch.float64).repeat(len(stamps), 1, 1)
+    _, order = np.unique([round_timestamp(stamp) for stamp in poses[:, 0].tolist()], return_index=True)
+    T_wc = torch.eye(4, dtype=torch.float64).repeat(len(order), 1, 1)
     T_wc[:, :3, :3] = torch.from_numpy(Rotation.from_quat(poses[order, 4:]).as_matrix())
     T_wc[:, :3, 3] = torch.from_numpy(poses[order, 1:4])
-    return Trajectory(torch.from_numpy(stamps), T_wc)
+    return Trajectory(torch.from_numpy(poses[order, 0]), T_wc)
 
 
 def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | None = None) -> None:
@@ -78,7 +79,8 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
         comment: Comment for the first line, or lines; None for no comment.
 
     Raises:
-        InputError: If ``trajectory`` is not a `Trajectory`, or one of its poses is not a rigid transform.
+        InputError: If ``trajectory`` is not a `Trajectory`, one of its poses is not a rigid transform, or two of
+            its timestamps are equal when rounded.
         OutputError: If the file cannot be written or the disk is full.
     """
     if not isinstance(trajectory, Trajectory):
@@ -89,13 +91,20 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
     is_rigid = are_rigid(trajectory.T_wc.detach(), ROTATION_TOLERANCE).numpy()
     if not is_rigid.all():
         raise InputError(f"{path}: pose {is_rigid.argmin()} is not a valid rigid transform; repair or remove it")
+    stamps = [round_timestamp(stamp) for stamp in trajectory.stamps.tolist()]
+    for index, (before, after) in enumerate(pairwise(stamps)):
+        if after == before:
+            raise InputError(
+                f"{path}: poses {index} and {index + 1} both have the time {after:.6f} s, rounded to 6 decimals; give"
+                " times in seconds, at least a microsecond apart"
+            )
     lines = [] if comment is None else ["# " + "\n# ".join(comment.splitlines()) + "\n"]
     if len(trajectory):
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
         poses = np.concatenate([T_wc[:, :3, 3], quaternions], axis=1).round(9) + 0.0  # + 0.0: no "-0.000000000"
         lines += [
             f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in pose) + "\n"
-            for stamp, pose in zip(trajectory.stamps.tolist(), poses.tolist(), strict=True)
+            for stamp, pose in zip(stamps, poses.tolist(), strict=True)
         ]
     write_text(Path(path), "".join(lines))
 

@@ -87,9 +87,8 @@ def rpe(
     KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
     if valid is not None:
         KORNIA_CHECK_SHAPE(valid, ["*", str(T_gc.shape[-3])])
-    exists = mask_or_all(valid, stamps)
-    batch = common_batch(T_gc.shape[:-3], T_ec.shape[:-3], stamps.shape[:-1], exists.shape[:-1])
-    exists = exists.expand(*batch, -1)
+    batch = common_batch(T_gc=(T_gc, 3), T_ec=(T_ec, 3), stamps=(stamps, 1), valid=(valid, 1))
+    exists = mask_or_all(valid, stamps).expand(*batch, -1)
     order = torch.argsort(~exists, dim=-1, stable=True)  # padding last
     times = torch.where(exists, stamps.to(torch.float64), torch.inf).gather(-1, order)
     _check_increasing(times)

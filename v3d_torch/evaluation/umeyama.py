@@ -11,7 +11,7 @@ from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import differentiable_rotation, to_matrix
-from v3d_torch.runtime.batches import check_weights, fill_padding, mask_or_all
+from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, mask_or_all
 
 _SAME_PLACE = 1e-12
 """Largest distance of points at one place from their mean, as a fraction of their distance from the origin. Rounding of
@@ -57,6 +57,7 @@ def umeyama(
     for column in (weights, valid):
         if column is not None:
             KORNIA_CHECK_SHAPE(column, ["*", str(p.shape[-2])])
+    common_batch(p=(p, 2), q=(q, 2), weights=(weights, 1), valid=(valid, 1))
     if weights is not None:
         check_weights(weights, mask_or_all(valid, weights))
     each = None if valid is None else valid[..., None]

@@ -91,6 +91,7 @@ def essential_ransac(
     for each in (weights, valid):
         if each is not None:
             KORNIA_CHECK_SHAPE(each, ["*", str(uv_a.shape[-2])])
+    batch = common_batch(uv_a=(uv_a, 2), uv_b=(uv_b, 2), K=(K, 2), weights=(weights, 1), valid=(valid, 1))
     valid = mask_or_all(valid, uv_a[..., 0]) & uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
     if weights is None:
         weights = torch.ones_like(uv_a[..., 0])
@@ -99,7 +100,6 @@ def essential_ransac(
     K = K.to(torch.float64)
     is_regular = torch.linalg.det(K.detach()).abs()[..., None] > 0  # false for NaN, too
     K = torch.where(is_regular[..., None], K, torch.eye(3, dtype=K.dtype, device=K.device))
-    batch = common_batch(uv_a.shape[:-2], uv_b.shape[:-2], K.shape[:-2], weights.shape[:-1], valid.shape[:-1])
     mask, row = (valid & is_regular).expand(*batch, -1), valid[..., None]
     problem = EpipolarProblem(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),

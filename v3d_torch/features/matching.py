@@ -57,12 +57,11 @@ def _match_descriptors_compiled(
 ) -> Tensor:
     if any(each.dtype != torch.uint8 or each.ndim < 2 or each.shape[-1] != _BYTES for each in (a, b)):
         return NotImplemented
-    masks = [valid for valid in (a_valid, b_valid) if valid is not None]
-    if any(valid.dtype != torch.bool for valid in masks):
+    if any(valid is not None and valid.dtype != torch.bool for valid in (a_valid, b_valid)):
         return NotImplemented
     if any(v is not None and v.shape[-1:] != each.shape[-2:-1] for each, v in ((a, a_valid), (b, b_valid))):
         return NotImplemented
-    batch = common_batch(*(each.shape[:-2] for each in (a, b)), *(valid.shape[:-1] for valid in masks))
+    batch = common_batch(a=(a, 2), b=(b, 2), a_valid=(a_valid, 1), b_valid=(b_valid, 1))
     a, b = (each.expand(*batch, *each.shape[-2:]) for each in (a, b))
     matches = torch.full(a.shape[:-1], -1)
     for index in np.ndindex(batch):
@@ -121,6 +120,7 @@ def match_descriptors(
     for descriptors, valid in ((a, a_valid), (b, b_valid)):
         if valid is not None:
             KORNIA_CHECK_SHAPE(valid, ["*", str(descriptors.shape[-2])])
+    common_batch(a=(a, 2), b=(b, 2), a_valid=(a_valid, 1), b_valid=(b_valid, 1))
     distance = _pairwise_hamming_distances(a, b)
     a_valid = distance.new_ones(a.shape[-2], dtype=torch.bool) if a_valid is None else a_valid
     b_valid = distance.new_ones(b.shape[-2], dtype=torch.bool) if b_valid is None else b_valid

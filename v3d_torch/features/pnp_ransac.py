@@ -88,11 +88,10 @@ def pnp_ransac(
     KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
     if valid is not None:
         KORNIA_CHECK_SHAPE(valid, ["*", str(points.shape[-2])])
-    present = mask_or_all(valid, uv[..., 0]) & points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)
     if initial_guess is not None:
         KORNIA_CHECK_SHAPE(initial_guess, ["*", "4", "4"])
-    guess = torch.Size() if initial_guess is None else initial_guess.shape[:-2]
-    batch = common_batch(points.shape[:-2], uv.shape[:-2], K.shape[:-2], present.shape[:-1], guess)
+    batch = common_batch(points=(points, 2), uv=(uv, 2), K=(K, 2), initial_guess=(initial_guess, 2), valid=(valid, 1))
+    present = mask_or_all(valid, uv[..., 0]) & points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)
     mask = present.expand(*batch, -1)
     count = mask.sum(dim=-1)
     data = (

@@ -35,3 +35,17 @@ def check_positive(**numbers: Tensor | float) -> None:
     for name, number in numbers.items():
         if not isinstance(number, Tensor) and not number > 0:
             raise ConfigError(f"{name} is {number}; give a number above 0")
+
+
+def check_not_negative(**numbers: Tensor | float) -> None:
+    """Check that thresholds are at least 0: each comparison with NaN is false, without a message.
+
+    Args:
+        numbers: Thresholds by the name of the argument; those that are tensors are not checked.
+
+    Raises:
+        ConfigError: If a number is negative or NaN.
+    """
+    for name, number in numbers.items():
+        if not isinstance(number, Tensor) and not number >= 0:
+            raise ConfigError(f"{name} is {number}; give a number of at least 0")

@@ -10,7 +10,7 @@ from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_positive
+from v3d_torch.geometry.argument_checks import check_not_negative, check_positive
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -24,7 +24,7 @@ _STRIP_HEIGHT = 120
 
 def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> Tensor:
     is_image = depth.dtype == torch.float32 and depth.ndim == 4 and depth.shape[1] == 1
-    if not is_image or kernel_size < 1 or kernel_size % 2 == 0 or not sigma > 0:
+    if not is_image or kernel_size < 1 or kernel_size % 2 == 0 or not sigma > 0 or not edge_ratio >= 0:
         return NotImplemented
     taps = np.array(_gaussian(kernel_size, sigma), np.float32)
     limits = np.float32(edge_ratio), np.float32(_MAX_VALID_DEPTH)
@@ -61,9 +61,10 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
         measurement. Differentiable in ``depth``, with the gates :math:`g` held constant.
 
     Raises:
-        ConfigError: If the window has no centre pixel, or ``sigma`` is not positive.
+        ConfigError: If the window has no centre pixel, ``sigma`` is not positive, or ``edge_ratio`` is negative or NaN.
     """
     check_positive(sigma=sigma)
+    check_not_negative(edge_ratio=edge_ratio)
     KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
     if kernel_size < 1 or kernel_size % 2 == 0:
         raise ConfigError(f"kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")

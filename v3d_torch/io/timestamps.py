@@ -29,6 +29,11 @@ def parse_timestamp(text: str) -> float:
     return next((value / units for min_value, units in _UNITS_SINCE_1970 if value >= min_value), value)
 
 
+def round_timestamp(stamp: float) -> float:
+    """Round a timestamp as trajectory files do, to microseconds: poses of equal rounded times would be one pose."""
+    return round(stamp, 6)
+
+
 def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
     """Pair two lists of timestamps one to one, nearest pairs first, as the TUM benchmark's ``associate.py`` does.
 

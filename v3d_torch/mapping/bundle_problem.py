@@ -234,6 +234,20 @@ def prepare_bundle(
             KORNIA_CHECK_SHAPE(column, ["*", str(pose.shape[-1])])
     if fixed is not None:
         KORNIA_CHECK_SHAPE(fixed, ["*", str(T_cw.shape[-3])])
+    batch = common_batch(
+        T_cw=(T_cw, 3),
+        points=(points, 2),
+        uv=(uv, 2),
+        pose=(pose, 1),
+        point=(point, 1),
+        K=(K, 2),
+        inverse_depth=(inverse_depth, 1),
+        pixel_sigma=(pixel_sigma, 1),
+        inverse_depth_sigma=(inverse_depth_sigma, 1),
+        fixed=(fixed, 1),
+        weights=(weights, 1),
+        valid=(valid, 1),
+    )
     check_finite_arguments(T_cw=T_cw, points=points)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
@@ -247,15 +261,6 @@ def prepare_bundle(
         weights = torch.ones(pose.shape, dtype=torch.float64, device=uv.device)
     else:
         check_weights(weights, valid)
-    batch = common_batch(
-        T_cw.shape[:-3],
-        points.shape[:-2],
-        target.scale.shape[:-2],
-        pose.shape[:-1],
-        point.shape[:-1],
-        fixed.shape[:-1],
-        weights.shape[:-1],
-    )
     each = (*batch, pose.shape[-1])  # observation
     problem = BundleProblem(
         scale=target.scale.expand(*batch, 3, -1),

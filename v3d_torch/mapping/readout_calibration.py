@@ -12,10 +12,11 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import bundle_adjustment as kernels
-from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.kernels.compiler import can_read, compiled_by
 from v3d_torch.mapping.bundle_adjustment import sort_by_point
 from v3d_torch.mapping.bundle_problem import NEGLIGIBLE_DAMPING, BundleProblem, prepare_bundle
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
@@ -92,11 +93,22 @@ def estimate_readout(
 
     Raises:
         InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, if a
-            pose or landmark is not finite, or if a weight is negative, infinite or NaN.
+            pose or landmark is not finite, if a weight is negative, infinite or NaN, or if ``information`` is negative
+            or NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
+    old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
+    if can_read(old_information) and not bool((old_information >= 0).all()):
+        raise InputError("information has a value that is negative or NaN; give inverse variances of at least 0")
     KORNIA_CHECK_SHAPE(readout_jacobian, ["*", str(pose.shape[-1]), "2"])
-    batch = common_batch(T_cw.shape[:-3], readout_jacobian.shape[:-2])
+    batch = common_batch(
+        seconds=(seconds, 0),
+        information=(information, 0),
+        readout_jacobian=(readout_jacobian, 2),
+        T_cw=(T_cw, 3),
+        points=(points, 2),
+        uv=(uv, 2),
+    )
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
     problem, state, valid = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
@@ -107,7 +119,6 @@ def estimate_readout(
     slope, curvature = reduced_cost_derivatives(*state, by_readout, *problem)
     unadjusted = 2 * (problem.weights[..., None, :] * by_readout.square()).sum(dim=(-2, -1))
     old_seconds = torch.as_tensor(seconds, dtype=torch.float64, device=uv.device)
-    old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
     estimates = torch.broadcast_tensors(old_seconds, old_information, slope, curvature, unadjusted)
     new_seconds, new_information = combine_readouts(*estimates)
     return new_seconds.to(result_dtype(T_cw.dtype)), new_information.to(working_dtype(T_cw.dtype))

@@ -8,7 +8,7 @@ import torch
 from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_not_negative
 from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.objects.chamfer import chamfer_distance
@@ -57,7 +57,9 @@ def intra_object_motion(
 
     Raises:
         InputError: If a coordinate of a valid point is not finite or exceeds 1e18 m, or if a mask is not bool.
+        ConfigError: If ``distance_threshold`` is a number that is negative or NaN.
     """
+    check_not_negative(distance_threshold=distance_threshold)
     check_masks(previous_valid=previous_valid, current_valid=current_valid)
     dtype = previous.dtype
     previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))

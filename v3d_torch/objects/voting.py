@@ -10,8 +10,9 @@ from torch import Tensor
 
 from v3d_torch.config import VotingConfig
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_not_negative
 from v3d_torch.geometry.precision import result_dtype, working_dtype
+from v3d_torch.runtime.batches import common_batch
 
 _STATIC_VOTER_RATIO = 0.5
 """Maximum motion of the centroid of a voting object if the free-space check is enabled, as a fraction of the distance
@@ -67,14 +68,17 @@ def hough_vote(
 
     Raises:
         InputError: If ``present`` is not bool.
-        ConfigError: If ``temperature`` is a number that is not positive.
+        ConfigError: If ``temperature`` is a number that is not positive, or a threshold is a number that is negative or
+            NaN.
     """
     check_masks(present=present)
+    check_not_negative(distance_threshold=distance_threshold, vote_threshold=vote_threshold)
     if isinstance(temperature, (int, float)) and not temperature > 0:  # also if it is NaN
         raise ConfigError(f"hough_vote: temperature is {temperature}; give a number above 0, or None")
     KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
     KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
     KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])
+    common_batch(previous=(previous, 2), current=(current, 2), present=(present, 1))
     diagonal = torch.eye(present.shape[-1], dtype=torch.bool, device=present.device)
     comparable = present[..., :, None] & present[..., None, :] & ~diagonal
 

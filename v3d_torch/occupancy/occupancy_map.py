@@ -105,9 +105,12 @@ class OccupancyMap:
             T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
 
         Raises:
-            InputError: If ``static`` is not bool, or the pose is not a rigid transform or too far from the origin.
+            InputError: If ``static`` is not bool, the image has no pixels, or the pose is not a rigid transform or too
+                far from the origin.
         """
         check_masks(static=static)
+        if depth.numel() == 0:
+            raise InputError(f"the depth image has shape {tuple(depth.shape)}; give an image with pixels")
         KORNIA_CHECK_SHAPE(T_wc, ["4", "4"])
         config = self.config
         limit = _MAX_CAMERA_BLOCKS * SIDE * config.voxel_size

@@ -179,7 +179,13 @@ class DenseAligner(torch.nn.Module):
                 " camera of the size of the images"
             )
         batch = common_batch(
-            *(image.shape[:-3] for image in images), motion.shape[:-2], *(mask.shape[:-2] for mask in masks)
+            grey_a=(grey_a, 3),
+            depth_a=(depth_a, 3),
+            grey_b=(grey_b, 3),
+            depth_b=(depth_b, 3),
+            T_ba=(T_ba, 2),
+            static_a=(static_a, 2),
+            static_b=(static_b, 2),
         )
         columns = (
             *(image.to(torch.float32).expand(*batch, 1, *size).reshape(-1, 1, *size) for image in images),

@@ -25,7 +25,7 @@ from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.runtime.batches import fill_padding
+from v3d_torch.runtime.batches import common_batch, fill_padding
 
 _MIN_HEIGHT = 2
 """Minimum number of rows: the readout is the time from the first to the last row."""
@@ -190,6 +190,16 @@ def compensate_rolling_shutter(
         KORNIA_CHECK_SHAPE(readout_jacobian, ["*", str(uv.shape[-2]), "2"])
     if height < _MIN_HEIGHT:
         raise ConfigError(f"height is {height}; give at least {_MIN_HEIGHT} rows")
+    common_batch(
+        uv=(uv, 2),
+        row=(row, 1),
+        inverse_depth=(inverse_depth, 1),
+        velocity=(velocity, 1),
+        readout=(readout, 0),
+        K=(K, 2),
+        readout_jacobian=(readout_jacobian, 2),
+        valid=(valid, 1),
+    )
     seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]
     each = None if valid is None else valid[..., None]
     observed = fill_padding(uv, each, 0.0)

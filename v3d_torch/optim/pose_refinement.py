@@ -223,6 +223,17 @@ def refine_pose(
     for each in (inverse_depth, weights, valid):
         if each is not None:
             KORNIA_CHECK_SHAPE(each, ["*", str(points.shape[-2])])
+    batch = common_batch(
+        T_cw=(T_cw, 2),
+        points=(points, 2),
+        uv=(uv, 2),
+        K=(K, 2),
+        inverse_depth=(inverse_depth, 1),
+        pixel_sigma=(pixel_sigma, 1),
+        inverse_depth_sigma=(inverse_depth_sigma, 1),
+        weights=(weights, 1),
+        valid=(valid, 1),
+    )
     finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
     if weights is not None:
@@ -239,7 +250,6 @@ def refine_pose(
         valid=valid,
     )
     initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)
-    batch = common_batch(initial.shape[:-2], points.shape[:-2], scale.shape[:-2], problem.weights.shape[:-1])
     if batch:
         initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
     minimise = partial(_minimise, initial, rounds=rounds, iterations=iterations, tolerance=tolerance)

@@ -132,7 +132,14 @@ def _whiten_compiled(measured: Measurements, K: Tensor) -> WhitenedMeasurements:
     columns = (inverse_depth, *sigmas)
     if any(each.requires_grad or each.dtype != torch.float64 for each in (uv, *columns, K)):
         return NotImplemented
-    batch = common_batch(uv.shape[:-2], K.shape[:-2], *(each.shape[:-1] for each in columns))
+    pixel_sigma, inverse_depth_sigma = columns[1:]
+    batch = common_batch(
+        uv=(uv, 2),
+        K=(K, 2),
+        inverse_depth=(inverse_depth, 1),
+        pixel_sigma=(pixel_sigma, 1),
+        inverse_depth_sigma=(inverse_depth_sigma, 1),
+    )
     given = (
         uv.expand(*batch, *uv.shape[-2:]),
         *(each.expand(*batch, uv.shape[-2]) for each in columns),

@@ -89,10 +89,28 @@ def check_weights(weights: Tensor, valid: Tensor) -> None:
         raise InputError("weights has an infinite value; give finite weights")
 
 
-def common_batch(*batches: torch.Size) -> torch.Size:
-    """Return the broadcast shape of several batch shapes; faster than torch if those with dimensions are equal."""
-    first, *others = {batch for batch in batches if batch} or {torch.Size()}
-    return torch.broadcast_shapes(first, *others) if others else first
+def common_batch(**arguments: tuple[Tensor | float | None, int]) -> torch.Size:
+    """Return the broadcast shape of the batches of arguments; faster than torch if those with dimensions are equal.
+
+    Args:
+        arguments: Arguments by name, each with its number of dimensions without the batch. Only tensors have a batch.
+
+    Raises:
+        InputError: If the batches do not broadcast.
+    """
+    batches = {
+        name: value.shape[: value.ndim - dims]
+        for name, (value, dims) in arguments.items()
+        if isinstance(value, Tensor) and value.ndim > dims
+    }
+    first, *others = set(batches.values()) or {torch.Size()}
+    if not others:
+        return first
+    try:
+        return torch.broadcast_shapes(first, *others)
+    except RuntimeError as error:
+        found = ", ".join(f"{name} {tuple(batch)}" for name, batch in batches.items())
+        raise InputError(f"the leading dimensions do not broadcast: {found}; give equal ones, or 1") from error
 
 
 def to_rows(tensor: Tensor, batch: torch.Size) -> NDArray[Any]:

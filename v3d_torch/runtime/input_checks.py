@@ -13,6 +13,7 @@ from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import implausible_median
+from v3d_torch.io.timestamps import round_timestamp
 from v3d_torch.runtime.value_rules import FINITE, FRACTIONS, Rule
 from v3d_torch.types import Instances, RGBDFrame
 
@@ -109,7 +110,7 @@ def check_next(frame: RGBDFrame, previous_stamp: float) -> None:
     """
     if previous_stamp == -math.inf and (median := implausible_median(frame.depth)) is not None:
         raise InputError(f"frame {frame.index}: its median depth is {median:.2g} m; give depth in metres")
-    if frame.stamp <= previous_stamp:
+    if round_timestamp(frame.stamp) <= round_timestamp(previous_stamp):
         raise InputError(
             f"frame {frame.index}: its stamp, {frame.stamp:.6f} s, is not after {previous_stamp:.6f} s, that of the"
             " previous frame; give frames in order of time, each once"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -53,13 +54,15 @@ class CameraState:
             stamp: Time, seconds, not before that of this state.
 
         Raises:
-            InputError: If the time is before that of this state, or not a number.
+            InputError: If the time is before that of this state, or not finite.
         """
         if not stamp >= self.stamp:  # the covariance would shrink, and become indefinite
             raise InputError(
                 f"no prediction for {stamp:.6f} s: the state is of {self.stamp:.6f} s; give a later time, or use"
                 " pose_at, which knows earlier ones"
             )
+        if stamp == math.inf:
+            raise InputError("no prediction for inf s: the time is not finite; give seconds")
         joint = join_covariances(self.covariance, self.cross_covariance, self.twist_covariance)
         moving = min(stamp - self.stamp, MAX_EXTRAPOLATION)
         joint, twist = predict_covariance(joint, self.twist, moving), self.twist
