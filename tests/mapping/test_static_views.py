@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from helpers.box_room import CAMERA, EYE, keyframe
+from kornia.core.exceptions import ShapeError
 
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.camera import PinholeCamera, back_project
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.mapping.static_views import StaticViews
@@ -40,6 +43,23 @@ def test_depth_is_stored_with_a_tenth_of_a_millimetre() -> None:
     near = depth[0] < 13
     assert (view.depth - depth[0])[near].abs().max() < 1.1e-4
     assert (view.depth[depth[0] > 13.2] == 0).all()
+
+
+@pytest.mark.parametrize("wrong", ["image", "depth", "static"])
+def test_images_of_another_size_than_the_camera_are_rejected(wrong: str) -> None:
+    """The upper left part of a larger image was stored."""
+    images = {"image": GREY, "depth": torch.ones(1, 240, 320), "static": ALL}
+    images[wrong] = images[wrong].repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+    with pytest.raises(ShapeError):
+        StaticViews(CAMERA, 2).add(keyframe(EYE), **images)
+
+
+def test_mask_that_is_not_bool_and_stride_below_one_are_rejected() -> None:
+    with pytest.raises(InputError, match=r"^static has the type torch\.uint8; give a mask of type torch\.bool$"):
+        StaticViews(CAMERA, 2).add(keyframe(EYE), GREY, torch.ones(1, 240, 320), ALL.to(torch.uint8))
+    for stride in (0, -1):
+        with pytest.raises(ConfigError, match=f"^stride is {stride}; give a number of pixels of at least 1$"):
+            StaticViews(CAMERA, stride)
 
 
 def test_pose_of_the_depth_is_that_at_its_time() -> None:

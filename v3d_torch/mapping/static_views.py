@@ -7,8 +7,11 @@ from copy import copy
 from dataclasses import dataclass
 
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.errors import ConfigError
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.geometry.se3 import invert
@@ -67,12 +70,18 @@ class StaticViews(StatefulComponent):
         camera: Camera of the views, without distortion.
         rays: Viewing rays at unit depth, float32, shape :math:`(h, w, 3)`. The ray of a pixel is the exact ray of the
             pixel of the frame from which it was sampled.
+
+    Raises:
+        ConfigError: If the stride is not at least 1.
     """
 
     _STATE = ("_views",)
 
     def __init__(self, camera: PinholeCamera, stride: int) -> None:
+        if stride < 1:
+            raise ConfigError(f"stride is {stride}; give a number of pixels of at least 1")
         self.stride = stride
+        self._size = str(camera.height), str(camera.width)
         self.camera = PinholeCamera(
             fx=camera.fx / stride,
             fy=camera.fy / stride,
@@ -126,7 +135,14 @@ class StaticViews(StatefulComponent):
             depth_delay: Time of the depth image minus time of the colour image by their timestamps, seconds.
             T_dc: Motion of the camera from the time of the colour image to that of the depth image, see `FrameResult`,
                 float64, shape :math:`(4, 4)`; None for a camera at rest.
+
+        Raises:
+            InputError: If ``static`` is not bool.
         """
+        check_masks(static=static)
+        KORNIA_CHECK_SHAPE(image, ["3", *self._size])
+        KORNIA_CHECK_SHAPE(depth, ["1", *self._size])
+        KORNIA_CHECK_SHAPE(static, [*self._size])
         T_dc = torch.eye(4, dtype=torch.float64) if T_dc is None else T_dc
         units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
