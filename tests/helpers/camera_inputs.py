@@ -169,12 +169,12 @@ def rolling(batch: int, count: int, dtype: torch.dtype) -> Inputs:
 
 
 def trajectories(batch: int, count: int, dtype: torch.dtype) -> Inputs:
-    """Ground truths and noisy estimates in another world frame, at 10 poses per second."""
+    """Ground truths and noisy estimates in another world frame, one pose per second."""
     random = _Random(batch, count)
     steps = 0.1 * random.normal(batch, count, 6)
     T_gc = se3_exp(steps.cumsum(dim=1))
     T_ec = se3_exp(random.normal(batch, 1, 6)) @ T_gc @ se3_exp(0.02 * random.normal(batch, count, 6))
-    stamps = (torch.arange(count) / 10).repeat(batch, 1)
+    stamps = torch.arange(count, dtype=torch.float32).repeat(batch, 1)
     return cast({"T_gc": T_gc, "T_ec": T_ec, "stamps": stamps, "valid": random.mask()}, dtype)
 
 

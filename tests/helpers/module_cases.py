@@ -225,8 +225,8 @@ CAMERA_CASES = {
         ("uv", "row", "inverse_depth", "velocity", "K", "readout_jacobian"),
     ),
     "RelativePoseError": Case(
-        v3d.RelativePoseError(0.3),
-        partial(v3d.rpe, delta=0.3),
+        v3d.RelativePoseError(3.0),
+        partial(v3d.rpe, delta=3.0),
         camera_inputs.trajectories,
         dict.fromkeys(("T_gc", "T_ec", "stamps"), "valid"),
         ("T_gc", "T_ec"),
