@@ -88,8 +88,9 @@ def test_run_whose_results_cannot_be_written_when_interrupted_resumes_exactly(
     whole, again = tmp_path / "whole", tmp_path / "again"
     for each in (folder, whole, again):
         each.mkdir()
-    Run(request, Walk(), UprightSegmenter(segment_red), whole)(lambda *_: None)
-    run = Run(request, Walk(), UprightSegmenter(segment_red), folder)
+    walk = Walk(24)
+    Run(request, walk, UprightSegmenter(segment_red), whole)(lambda *_: None)
+    run = Run(request, walk, UprightSegmenter(segment_red), folder)
 
     def interrupt(frame: RGBDFrame, result: FrameResult) -> None:
         if frame.index >= 8 and run.pipeline.slam.back_end.keyframe is not None:
@@ -99,7 +100,7 @@ def test_run_whose_results_cannot_be_written_when_interrupted_resumes_exactly(
     with pytest.raises(OutputError, match=r"map\.ply"):
         run(interrupt)
     checkpoint = read_checkpoint(folder)
-    Run(request, Walk(), UprightSegmenter(segment_red), again, checkpoint=checkpoint)(lambda *_: None)
+    Run(request, walk, UprightSegmenter(segment_red), again, checkpoint=checkpoint)(lambda *_: None)
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
         assert (again / name).read_bytes() == (whole / name).read_bytes(), name
 
