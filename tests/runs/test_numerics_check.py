@@ -279,6 +279,7 @@ def test_checked_recorded_images_give_the_same_results(real_sequence: Callable[[
     assert plain == checked
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_with_check_ends_at_nan_and_keeps_the_frames_before(demo: RGBDSequence, tmp_path: Path) -> None:
     def segment(frame: RGBDFrame) -> Instances:
         return replace(Instances.empty(480, 640), boxes=torch.full((frame.index // 2, 4), math.nan))
