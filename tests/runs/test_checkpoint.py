@@ -124,7 +124,7 @@ def test_next_checkpoint_reads_the_sizes_of_new_files_only(tmp_path: Path, monke
     assert read_checkpoint(tmp_path).sequence["sizes"] == [[3, None]] * 5
 
 
-def test_error_of_a_checkpoint_is_forgotten_when_the_next_one_is_saved(
+def test_error_of_a_checkpoint_is_removed_when_the_next_one_is_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pipeline = make_pipeline(prefetch=False)
