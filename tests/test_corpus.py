@@ -16,7 +16,7 @@ from helpers.corpus.case import Case, Fails, Succeeds, Workspace
 from helpers.forked_command import call_forked
 from typer.testing import CliRunner
 
-from v3d_torch.cli import report, run
+from v3d_torch.cli import run
 
 CASES = [
     pytest.param(category, case, id=f"{category}: {case.name}")
@@ -138,14 +138,3 @@ def test_earlier_results_are_replaced_and_other_files_are_kept(place: Workspace)
     assert (place.out / "notes.txt").read_text() == "of an earlier run"
     stamps = [f"{float(line.split()[0]):.6f}.png" for line in (place.out / "trajectory.txt").read_text().splitlines()]
     assert sorted(path.name for path in (place.out / "masks").iterdir()) == stamps
-
-
-def test_clear_earlier_results_removes_all_files_of_a_run(place: Workspace) -> None:
-    """A new result file must also be added to the files that `clear_earlier_results` removes."""
-    from v3d_torch.runs.result_folder import clear_earlier_results
-
-    assert CliRunner().invoke(run.app, [*arguments(place), "--save-masks", "--mesh"]).exit_code == 0
-    assert CliRunner().invoke(report.app, [str(place.out)]).exit_code == 0
-    assert len(list(place.out.iterdir())) > 10
-    clear_earlier_results(place.out)
-    assert [path.name for path in place.out.iterdir()] == ["run.log"]

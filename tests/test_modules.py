@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import product
 
 import pytest
@@ -168,15 +168,17 @@ def test_results_inside_autocast_equal_those_outside(case: Case, dtype: torch.dt
 each_of_the_camera = pytest.mark.parametrize("case", CAMERA_CASES.values(), ids=CAMERA_CASES)
 
 
+def by_position(case: Case, names: Iterable[str]) -> Callable[..., tuple[Tensor, ...]]:
+    """The module as a function whose arguments have no names, as `torch.func.vmap` needs it."""
+    return lambda *row: tensors(case.module(**dict(zip(names, row, strict=True))))
+
+
 @each_of_the_camera
 def test_module_can_be_mapped_over_a_batch(case: Case) -> None:
     """`torch.func.vmap` traces the torch functions; without it, compiled code may run."""
     inputs = case.inputs(2, 20, torch.float64)
 
-    def apply(*row: Tensor) -> tuple[Tensor, ...]:
-        return tensors(case.module(**dict(zip(inputs, row, strict=True))))
-
-    mapped = torch.func.vmap(apply)(*inputs.values())
+    mapped = torch.func.vmap(by_position(case, inputs))(*inputs.values())
     for one, other in zip(mapped, tensors(case.module(**inputs)), strict=True):
         if case.sampled:
             assert one.shape == other.shape and one.dtype == other.dtype
@@ -191,10 +193,7 @@ def test_clouds_can_be_mapped_over_a_batch(case: Case) -> None:
     """Torch functions, which compare all pairs of points, agree with compiled code and trees, except for padding."""
     inputs = case.inputs(3, 150, torch.float64)
 
-    def apply(*row: Tensor) -> tuple[Tensor, ...]:
-        return tensors(case.module(**dict(zip(inputs, row, strict=True))))
-
-    mapped = torch.func.vmap(apply)(*(each.unflatten(0, (3, 1)) for each in inputs.values()))
+    mapped = torch.func.vmap(by_position(case, inputs))(*(each.unflatten(0, (3, 1)) for each in inputs.values()))
     for one, other in zip(mapped, tensors(case.module(**inputs)), strict=True):
         torch.testing.assert_close(without_padding(one.flatten(0, 1), other), other, equal_nan=True)
 

@@ -6,11 +6,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 from helpers.batches import plan_seeds, repeat_sequence
 
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.result_folder import lock_results
+
+pytestmark = pytest.mark.usefixtures("no_figures")
 
 
 def stop_after(frames: int) -> tuple[list[int], Callable[[int], None]]:

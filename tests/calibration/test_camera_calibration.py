@@ -77,7 +77,7 @@ def test_delay_is_estimated_only_if_the_depth_is_registered(shift: int) -> None:
     assert (estimate.accepted, estimate.reason) == ((True, "") if shift == 3 else (False, NOT_DETERMINED))
 
 
-def test_depth_scale_is_told_by_measured_poses_only() -> None:
+def test_depth_scale_is_determined_by_measured_poses_only() -> None:
     """A room of twice the size in metres means half the units per metre."""
     calibration = calibrate(scale=2.0)
     estimate = estimate_of(calibration, "depth_scale")
@@ -101,7 +101,7 @@ def test_depth_in_floating_point_has_no_scale() -> None:
     assert calibration.camera.depth_scale is None
 
 
-def test_camera_at_rest_tells_no_delay() -> None:
+def test_camera_at_rest_determines_no_delay() -> None:
     views, trajectory = make_views(COUNT, moving=False)
     calibration = calibrate_camera(MapTables(), views, trajectory, None, CAMERA, CAMERA, Config())
     assert estimate_of(calibration, "depth_delay").reason == NOT_DETERMINED

@@ -43,7 +43,7 @@ def test_camera_states_the_delay_that_timestamps_do_not() -> None:
     assert float(alignment.refine(ZERO).values[2]) == pytest.approx(0.0, abs=0.003)
 
 
-def test_better_values_are_told_from_equal_ones() -> None:
+def test_better_values_are_distinguished_from_equal_ones() -> None:
     shifted, found = align(shift=(20, 0))
     assert shifted.is_better(found.values, ZERO)
     assert not shifted.is_better(ZERO, found.values)
@@ -63,7 +63,7 @@ def test_values_must_be_better_in_both_halves_of_the_run(monkeypatch: pytest.Mon
         assert alignment.is_better(torch.tensor([17.0, 0.0, 0.0]), ZERO) == expected
 
 
-def test_camera_at_rest_tells_the_shift_and_no_delay() -> None:
+def test_camera_at_rest_determines_the_shift_and_no_delay() -> None:
     _, found = align(shift=(12, -8), moving=False)
     torch.testing.assert_close(found.values[:2], torch.tensor([-12.0, 8.0]).double(), rtol=0, atol=1.5)
     assert not float(found.sigma[2]) < 0.05

@@ -47,13 +47,13 @@ def test_errors_of_the_estimate_do_not_shrink_the_scale() -> None:
     assert mean == pytest.approx(1.0, abs=0.005)
 
 
-def test_few_poses_and_a_camera_that_only_turns_tell_no_scale() -> None:
+def test_few_poses_and_a_camera_that_only_turns_give_no_scale() -> None:
     assert metric_scale(make_trajectory(5), make_trajectory(5)) is None
     assert metric_scale(make_trajectory(size=0.0), make_trajectory(size=0.0)) is None
     assert metric_scale(make_trajectory(), make_trajectory(scale=0.0)) is None
 
 
-def test_positions_that_are_not_correlated_tell_no_scale() -> None:
+def test_positions_that_are_not_correlated_give_no_scale() -> None:
     """All combinations of four signs: two are the measured position, the others the estimated one."""
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 4)
     stamps, T_wc = torch.arange(16, dtype=torch.float64), torch.eye(4, dtype=torch.float64).repeat(2, 16, 1, 1)

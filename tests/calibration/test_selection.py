@@ -86,7 +86,7 @@ def test_difference_that_errors_of_the_camera_model_explain_is_not_accepted(
         assert each.value == pytest.approx(getattr(TRUE, each.name), abs=0.5)
 
 
-def test_camera_at_rest_tells_nothing() -> None:
+def test_intrinsics_of_a_camera_at_rest_are_not_accepted() -> None:
     estimates = select(replace(KNOWN, fx=1.08 * TRUE.fx, fy=1.08 * TRUE.fy), swing=torch.zeros(6).double())
     assert not any(each.accepted for each in estimates.values() if each.name in ("fx", "fy", "cx", "cy"))
 

@@ -248,7 +248,7 @@ def test_finished_runs_are_not_overwritten(repaired: tuple[Path, Result, dict[Pa
 
 
 @pytest.fixture
-def mended(repaired: tuple[Path, Result, dict[Path, int]], tmp_path: Path) -> tuple[Path, list[str | Path]]:
+def moved(repaired: tuple[Path, Result, dict[Path, int]], tmp_path: Path) -> tuple[Path, list[str | Path]]:
     """Copy of a sequence and of its finished run, and the arguments that resume the batch."""
     data, out = tmp_path / "moved" / "good", tmp_path / "out"
     shutil.copytree(repaired[0] / "data" / "good", data)
@@ -256,8 +256,8 @@ def mended(repaired: tuple[Path, Result, dict[Path, int]], tmp_path: Path) -> tu
     return data, ["--seqs", data, "--configs", "baseline", "--out", out, "--resume"]
 
 
-def test_finished_run_of_a_moved_sequence_is_kept(mended: tuple[Path, list[str | Path]]) -> None:
-    result = call(*mended[1])
+def test_finished_run_of_a_moved_sequence_is_kept(moved: tuple[Path, list[str | Path]]) -> None:
+    result = call(*moved[1])
     assert result.exit_code == 0 and ", seed" not in result.stdout, result.output
 
 
@@ -270,9 +270,9 @@ def test_finished_run_of_a_moved_sequence_is_kept(mended: tuple[Path, list[str |
     ],
 )
 def test_finished_run_of_another_recording_or_camera_is_not_kept(
-    name: str, before: str, after: str, mended: tuple[Path, list[str | Path]]
+    name: str, before: str, after: str, moved: tuple[Path, list[str | Path]]
 ) -> None:
-    data, arguments = mended
+    data, arguments = moved
     text = (data / name).read_text()
     assert before in text
     (data / name).write_text(text.replace(before, after, 1))

@@ -74,7 +74,7 @@ def test_existing_file_and_unknown_sequence_are_errors(sequence: Path, tmp_path:
     assert not (tmp_path / "new.yaml").exists()
 
 
-def test_estimated_depth_scale_and_damaged_ground_truth_are_told(sequence: Path, tmp_path: Path) -> None:
+def test_estimated_depth_scale_and_damaged_ground_truth_are_reported(sequence: Path, tmp_path: Path) -> None:
     folder = tmp_path / "millimetres"
     shutil.copytree(sequence, folder)
     for path in (folder / "depth").iterdir():

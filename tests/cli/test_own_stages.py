@@ -79,6 +79,7 @@ def test_missing_module_is_one_line_before_the_run(sequence: Path, tmp_path: Pat
     assert_error_line(done, "stages.odometry=no_lab:PnP: the module no_lab cannot be imported", "PYTHONPATH")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_failure_of_a_stage_is_named_and_the_log_has_its_traceback(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -92,6 +93,7 @@ def test_failure_of_a_stage_is_named_and_the_log_has_its_traceback(
     assert "return 1 / 0" in (tmp_path / "out" / "run.log").read_text()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stage_that_exits_ends_the_run_with_the_results_so_far(
     sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

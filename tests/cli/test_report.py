@@ -181,7 +181,7 @@ def test_errors_equal_those_of_the_run(results: Path) -> None:
 
 
 def test_help_names_the_options() -> None:
-    assert "--groundtruth" in call("--help").stdout
+    assert "--groundtruth" in call_here("--help").stdout
 
 
 # --- incomplete results

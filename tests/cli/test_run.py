@@ -21,14 +21,14 @@ import pytest
 import typer.main
 from helpers.bag_messages import read_with_mcap
 from helpers.batches import ENDLESS, repeat_sequence
-from helpers.commands import RUN_FILES, assert_error_line, call, call_here, command, environment, files_in
+from helpers.commands import RUN_FILES, assert_error_line, call, call_here, command, environment, files_in, invoke
 from helpers.corpus.outputs import at_frame
 from helpers.demo_frames import copy_frames
 from helpers.forked_command import call_forked, start_forked
 from helpers.waiting import wait_until
 from typer.testing import Result
 
-from v3d_torch.cli import run
+from v3d_torch.cli import report, run
 from v3d_torch.datasets.demo.scenes.walking import WALK_SPEED, WALK_START
 from v3d_torch.datasets.demo.sequence import FRAME_COUNT, FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
@@ -102,16 +102,18 @@ def test_run_writes_all_files(first_out: Path, sequence: Path) -> None:
     assert sum("frame" in line and "tracked" in line for line in log) == 30
 
 
-def test_every_file_of_a_run_is_removed_before_the_next_one(sequence: Path, tmp_path: Path) -> None:
+def test_every_file_of_a_run_is_removed_before_the_next_one(tmp_path: Path) -> None:
     """A file that is not in the list of results would stay, and the report would show it."""
-    arguments = (*with_masks(sequence), "--save-masks", "--mesh", "--occupancy", "--out", "out")
-    done = call_here(*arguments, cwd=tmp_path)
+    part, out = tmp_path / "part", tmp_path / "out"
+    copy_frames(part, range(45, 57))
+    done = call_here(*with_masks(part), "--save-masks", "--mesh", "--occupancy", "--out", out, cwd=tmp_path)
     assert (done.exit_code, done.stderr) == (0, "")
-    written = files_in(tmp_path / "out")
-    assert written >= RUN_FILES | OBJECT_FILES | {"mesh.ply", "occupancy.npz", "figures/occupancy.png"}
+    assert invoke(report.app, out).exit_code == 0
+    written = files_in(out)
+    assert written >= RUN_FILES | OBJECT_FILES | {"mesh.ply", "occupancy.npz", "figures/occupancy.png", "report.html"}
     assert any(name.startswith("masks/") for name in written)
-    clear_earlier_results(tmp_path / "out")
-    assert files_in(tmp_path / "out") == {"run.log"}
+    clear_earlier_results(out)
+    assert [path.name for path in out.iterdir()] == ["run.log"]
 
 
 def test_folder_to_which_another_run_writes_is_an_error_and_stays(sequence: Path, tmp_path: Path) -> None:
@@ -127,9 +129,9 @@ def test_folder_to_which_another_run_writes_is_an_error_and_stays(sequence: Path
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows does not remove open files")
-def test_result_folder_that_is_removed_during_the_run_is_complete_and_usable(sequence: Path, tmp_path: Path) -> None:
+def test_result_folder_that_is_removed_during_the_run_is_complete_and_usable(moment: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    arguments = (*with_masks(sequence), "--out", out, "--serial")
+    arguments = (*with_masks(moment), "--out", out, "--serial")
     with at_frame(4, lambda: shutil.rmtree(out)):
         done = call_here(*arguments, cwd=tmp_path)
     warning = f"{out}: was removed during the run; what was written before is lost, such as log and masks"

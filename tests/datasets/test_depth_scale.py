@@ -131,7 +131,7 @@ def test_stated_depth_scale_is_used_whatever_the_images_look_like(tmp_path: Path
 
 
 @pytest.mark.parametrize("make", [images, tum, videos])
-def test_depth_scale_that_the_images_do_not_tell_is_asked_for(
+def test_depth_scale_that_is_neither_stated_nor_estimated_is_an_error(
     tmp_path: Path, make: Callable[[Path, float], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     far = np.random.default_rng(0).integers(2000, 7000, (HEIGHT, WIDTH))

@@ -214,7 +214,7 @@ def person_at(column: int, value: int = 1) -> Tensor:
     return truth
 
 
-def test_scores_of_two_people() -> None:
+def test_people_are_scored_by_frames_in_which_they_are_found_and_by_switches_of_ids() -> None:
     """The first switches ids twice, is missed, and returns with another id. The second is out of view for long."""
     evaluation = MaskEvaluation()
     depth, nothing = torch.ones(1, 48, 64), torch.zeros(48, 64, dtype=torch.bool)

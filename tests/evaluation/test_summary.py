@@ -129,7 +129,7 @@ def test_outcomes_without_ground_truth_have_no_tables() -> None:
     assert "tabular" not in format_latex(outcomes)
 
 
-def test_line_of_a_run_without_scores_tells_why() -> None:
+def test_line_of_a_run_without_scores_has_the_reason() -> None:
     assert str(Outcome("s", "full", 0, {"ate": None})) == "s, full, seed 0: no ground truth, not scored"
     lost = Outcome("s", "full", 0, {"ate": None, "diagnosis": "s: the camera was not found in any of the 9 frames"})
     assert str(lost) == "s, full, seed 0: s: the camera was not found in any of the 9 frames"

@@ -31,16 +31,20 @@ CONFIG = load_config(
 
 
 class Walk:
-    """Sequence along a textured wall, with a walking red person, sometimes not detected, and an unlabelled box."""
+    """Sequence along a textured wall, with a walking red person, sometimes not detected, and an unlabelled box.
+
+    Args:
+        frames: Number of frames; by default all, of which the last ones close the loop.
+    """
 
     name = "walk"
     camera = CAMERA
     groundtruth: Trajectory | None = None
 
-    def __init__(self) -> None:
+    def __init__(self, frames: int | None = None) -> None:
         noise = np.random.default_rng(0).integers(0, 200, (30, 140, 3), dtype=np.uint8)
         self._wall = cv2.resize(noise, (560, 120), interpolation=cv2.INTER_CUBIC)
-        self._columns = [*FORWARD, *DARK, *BACKWARD]
+        self._columns = [*FORWARD, *DARK, *BACKWARD][:frames]
         self.stamps = torch.arange(len(self), dtype=torch.float64) / 10
 
     def __len__(self) -> int:

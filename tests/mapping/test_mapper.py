@@ -42,6 +42,11 @@ class FrameFeeder:
         reference = keyframes[-1] if keyframes else None
         return self.mapper(frame, features(feature_count), FramePose(status, EYE, landmarks), reference) is not None
 
+    def until_keyframes(self, count: int, matched: int, status: TrackingStatus = TRACKED) -> None:
+        """Process equal frames until the map has a number of keyframes."""
+        for _ in steps_until(lambda: len(self.mapper.map.keyframes) >= count, 100, f"there are {count} keyframes"):
+            self(matched, status)
+
 
 def test_keyframe_is_inserted_when_tracking_gets_weak() -> None:
     feed = FrameFeeder(max_keyframe_interval=100, min_tracked=100, min_tracked_ratio=0.7)
@@ -110,14 +115,10 @@ def test_lost_camera_starts_a_disconnected_part_of_the_map_after_the_delay() -> 
 def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:
     feed = FrameFeeder(restart_after=0.5, max_keyframe_interval=5)
     assert feed(0, LOST)
-    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 2, 100, "there are 2 keyframes"):
-        feed(0, LOST)
-    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 3, 100, "there are 3 keyframes"):
-        feed(300)
-    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 4, 100, "there are 4 keyframes"):
-        feed(0, LOST)
-    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 5, 100, "there are 5 keyframes"):
-        feed(300)
+    feed.until_keyframes(2, 0, LOST)
+    feed.until_keyframes(3, 300)
+    feed.until_keyframes(4, 0, LOST)
+    feed.until_keyframes(5, 300)
     assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 1, 1, 2, 2]
     assert covisibility_edges(feed.mapper.map, 1000).tolist() == [[1, 2], [3, 4]]
 
@@ -125,11 +126,9 @@ def test_camera_that_is_lost_again_starts_another_part_of_the_map() -> None:
 def test_part_that_a_lost_camera_starts_after_parts_were_joined_has_an_unused_id() -> None:
     feed = FrameFeeder(restart_after=0.5)
     assert feed(0, LOST)
-    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 3, 100, "there are 3 keyframes"):
-        feed(0, LOST)
+    feed.until_keyframes(3, 0, LOST)
     feed.mapper.map.join_parts(0, 1)
-    for _ in steps_until(lambda: len(feed.mapper.map.keyframes) >= 4, 100, "there are 4 keyframes"):
-        feed(0, LOST)
+    feed.until_keyframes(4, 0, LOST)
     assert [keyframe.part for keyframe in feed.mapper.map.keyframes] == [0, 0, 2, 3]
 
 

@@ -154,7 +154,7 @@ def test_two_walkers_at_5_hz_are_dynamic(seed: int) -> None:
 
 
 @SEEDS
-def test_one_object_alone(seed: int) -> None:
+def test_single_object_is_classified(seed: int) -> None:
     walking = simulate(person(walk(-0.8, 2.8, 0.9, 0.0), 0.2), seconds=1.5, seed=seed, network=PARTIAL)
     assert_dynamic(walking, 0)
     for thing in (person(stand(0.2, 2.6)), chair(stand(0.2, 2.6))):

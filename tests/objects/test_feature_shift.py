@@ -89,7 +89,7 @@ def test_variance_is_that_of_the_median() -> None:
     assert 0.5 < variance / float(scatter) < 1.5  # the median of normally distributed values varies by pi / 2 more
 
 
-def test_few_features_tell_nothing() -> None:
+def test_shift_of_few_features_is_unknown() -> None:
     assert scene(0, (9.0, 0.0), on_object=8) == [None]
     for objects in (0, 1):
         on_objects = torch.ones(objects, 0, dtype=torch.bool)

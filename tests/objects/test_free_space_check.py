@@ -100,14 +100,6 @@ def test_misaligned_pixels_beside_a_surface_are_not_free(misalignment: int, expe
     assert vacated_fraction(surface((57, 63)), observed) == expected
 
 
-def test_static_object_has_vacated_nothing() -> None:
-    assert vacated_fraction(surface((60, 80)), view(((60, 80), OBJECT))) == 0.0
-
-
-def test_removed_object_has_vacated_everything() -> None:
-    assert vacated_fraction(surface((60, 80)), view()) == 1.0
-
-
 @pytest.mark.parametrize("step", [0, 1, 2, 3, 5, 10, 20, 22, 30])
 def test_vacated_fraction_is_the_uncovered_part_without_the_rim(step: int) -> None:
     expected = min(max(step - RIM, 0), 20) / 20

@@ -164,10 +164,14 @@ def test_velocity_of_a_part_is_known_sooner_than_the_place_of_the_whole() -> Non
     assert motion.visible_state.sigmas[0] < NOISE
 
 
+def make_state() -> ObjectState:
+    position, velocity = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    return ObjectState(1.0, position, velocity, (1.0, 0.1, 2.0), 1.5)
+
+
 def test_state_is_transformed_with_the_world() -> None:
     T = se3_exp(torch.tensor([0.3, -0.1, 0.2, 0.4, 0.5, -0.6], dtype=torch.float64))
-    position, velocity = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    state = ObjectState(1.0, position, velocity, (1.0, 0.1, 2.0), 2.0)
+    state = make_state()
     later, moved = state.predict(1.7), state.transform(T).predict(1.7)
     torch.testing.assert_close(moved.position, T[:3, :3] @ later.position + T[:3, 3])
     assert moved.variances == later.variances
@@ -187,11 +191,6 @@ def test_filter_in_a_corrected_world_goes_on_as_if_it_had_measured_there() -> No
         torch.testing.assert_close(found.position, expected.position)
         torch.testing.assert_close(found.velocity, expected.velocity)
         assert found.variances == expected.variances
-
-
-def make_state() -> ObjectState:
-    position, velocity = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    return ObjectState(1.0, position, velocity, (1.0, 0.1, 2.0), 1.5)
 
 
 def test_prediction_with_decay_is_the_same_in_one_step_and_in_two() -> None:

@@ -36,7 +36,7 @@ def test_board_continues_itself_rather_than_its_neighbour() -> None:
     assert ratio[0, 1] == ratio[1, 0] == -torch.inf  # both are visible where they were predicted
 
 
-def test_other_appearance_speaks_against_a_pair() -> None:
+def test_other_appearance_is_evidence_against_a_pair() -> None:
     same, other = (torch.eye(HISTOGRAM_SIZE)[i : i + 1] for i in (0, 1))
     boards = [Board(0.0)]
     assert float(evidence(boards, boards, same) - evidence(boards, boards, other)) > 5

@@ -104,7 +104,7 @@ def test_map_does_not_depend_on_the_implementation(monkeypatch: pytest.MonkeyPat
 # --- things that move
 
 
-def test_box_that_was_taken_away_is_forgotten() -> None:
+def test_box_that_was_taken_away_is_removed_from_the_map() -> None:
     occupancy = OccupancyMap(CONFIG)
     box = torch.tensor([[-0.2, -0.2, 0.9], [0.2, 0.2, 1.3]])
     for number in range(12):
@@ -329,7 +329,7 @@ def test_memory_is_bounded_on_a_long_drive(caplog: pytest.LogCaptureFixture) -> 
     assert near.max() > 2.0 * 59 and near.min() > 2.0 * 20  # the farthest were removed
 
 
-def test_window_around_the_camera_is_never_forgotten(caplog: pytest.LogCaptureFixture) -> None:
+def test_blocks_around_the_camera_are_never_removed(caplog: pytest.LogCaptureFixture) -> None:
     """It is reported once, and no block is copied."""
     occupancy = OccupancyMap(OccupancyConfig(max_blocks=1, window_radius=6.0))
     add_view(occupancy, 0, EYE)

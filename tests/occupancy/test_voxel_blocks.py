@@ -80,7 +80,7 @@ def test_kept_and_restored_blocks_have_the_same_log_odds() -> None:
     assert torch.equal(restored.log_odds, before["log_odds"]) and len(restored) == len(mask)
 
 
-def test_blocks_are_adopted_from_a_grid_that_knows_twice_as_many_of_their_voxels() -> None:
+def test_blocks_are_copied_from_a_grid_in_which_twice_as_many_of_their_voxels_are_known() -> None:
     known = torch.tensor([[10, 10, 10, 0], [19, 20, 0, 5]])  # of four blocks, in each grid; 0: the block does not exist
     grids = VoxelBlocks(), VoxelBlocks()
     for grid, counts, mark in zip(grids, known, (1, HIT), strict=True):

@@ -177,6 +177,7 @@ def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_
     assert (tmp_path / "map.ply").is_file() and (tmp_path / "dynamics.parquet").is_file()
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_interrupt_ends_the_run_and_keeps_the_frames_before(tmp_path: Path) -> None:
     pipeline = make_pipeline(Wall(interrupted=4))
     assert pipeline().failure == f"interrupted after 4 of {FRAMES} frames"
@@ -210,6 +211,7 @@ def test_mask_images_show_the_masked_pixels(tmp_path: Path) -> None:
         assert np.array_equal(image, np.where(square(Wall()[0]).masks[0].numpy(), 255, 0))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_frame_that_is_interrupted_after_its_pose_was_stored_has_no_row_in_the_tables(tmp_path: Path) -> None:
     pipeline = make_pipeline()
 

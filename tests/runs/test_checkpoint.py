@@ -88,8 +88,9 @@ def test_run_whose_results_cannot_be_written_when_interrupted_resumes_exactly(
     whole, again = tmp_path / "whole", tmp_path / "again"
     for each in (folder, whole, again):
         each.mkdir()
-    Run(request, Walk(), UprightSegmenter(segment_red), whole)(lambda *_: None)
-    run = Run(request, Walk(), UprightSegmenter(segment_red), folder)
+    walk = Walk(24)
+    Run(request, walk, UprightSegmenter(segment_red), whole)(lambda *_: None)
+    run = Run(request, walk, UprightSegmenter(segment_red), folder)
 
     def interrupt(frame: RGBDFrame, result: FrameResult) -> None:
         if frame.index >= 8 and run.pipeline.slam.back_end.keyframe is not None:
@@ -99,7 +100,7 @@ def test_run_whose_results_cannot_be_written_when_interrupted_resumes_exactly(
     with pytest.raises(OutputError, match=r"map\.ply"):
         run(interrupt)
     checkpoint = read_checkpoint(folder)
-    Run(request, Walk(), UprightSegmenter(segment_red), again, checkpoint=checkpoint)(lambda *_: None)
+    Run(request, walk, UprightSegmenter(segment_red), again, checkpoint=checkpoint)(lambda *_: None)
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
         assert (again / name).read_bytes() == (whole / name).read_bytes(), name
 
@@ -123,7 +124,7 @@ def test_next_checkpoint_reads_the_sizes_of_new_files_only(tmp_path: Path, monke
     assert read_checkpoint(tmp_path).sequence["sizes"] == [[3, None]] * 5
 
 
-def test_error_of_a_checkpoint_is_forgotten_when_the_next_one_is_saved(
+def test_error_of_a_checkpoint_is_removed_when_the_next_one_is_saved(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pipeline = make_pipeline(prefetch=False)

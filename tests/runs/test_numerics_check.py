@@ -129,11 +129,23 @@ def test_state_of_a_checked_system_is_loaded_into_its_stages(demo: RGBDSequence)
     assert loaded(second).status is TrackingStatus.TRACKED
 
 
-def follow_refinement(slam: V3DSLAM) -> list[Tensor]:
-    """Return a list with the last pose, to which its refinements by the next frame are appended."""
-    poses = [slam.poses.T_cw]
-    slam.register_stage_hook("refine_previous", lambda *_: poses.append(slam.poses.T_cw))
-    return poses
+@pytest.fixture
+def slam(demo: RGBDSequence) -> CheckedSLAM:
+    """System that has processed three frames."""
+    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
+    for index in range(3):
+        slam(demo[index])
+    return slam
+
+
+def assert_error_in_frame_3(slam: CheckedSLAM, demo: RGBDSequence, field: str) -> None:
+    """Check that the error names the field and the frame, and that the poses before are kept as last refined."""
+    last_poses = [slam.poses.T_cw]
+    slam.register_stage_hook("refine_previous", lambda *_: last_poses.append(slam.poses.T_cw))
+    with pytest.raises(NumericsError, match=rf"^frame 3: {re.escape(field)} is NaN"):
+        slam(demo[3])
+    assert len(slam.poses) == 3
+    assert torch.equal(slam.poses.T_cw, last_poses[-1])
 
 
 @pytest.mark.parametrize(
@@ -156,17 +168,11 @@ def follow_refinement(slam: V3DSLAM) -> list[Tensor]:
     ],
 )
 def test_replaced_stage_that_returns_nan_is_named_with_field_and_frame(
-    demo: RGBDSequence, stage: str, corrupt: Callable[[Any], Any], field: str
+    slam: CheckedSLAM, demo: RGBDSequence, stage: str, corrupt: Callable[[Any], Any], field: str
 ) -> None:
-    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
-    for index in range(3):
-        slam(demo[index])
-    last_poses, replaced = follow_refinement(slam), getattr(slam, stage)
+    replaced = getattr(slam, stage)
     setattr(slam, stage, lambda *args, **kwargs: corrupt(replaced(*args, **kwargs)))
-    with pytest.raises(NumericsError, match=rf"^frame 3: {re.escape(field)} is NaN"):
-        slam(demo[3])
-    assert len(slam.poses) == 3
-    assert torch.equal(slam.poses.T_cw, last_poses[-1])
+    assert_error_in_frame_3(slam, demo, field)
 
 
 @pytest.mark.parametrize(
@@ -177,13 +183,10 @@ def test_replaced_stage_that_returns_nan_is_named_with_field_and_frame(
     ],
 )
 def test_stage_used_by_other_stages_that_returns_nan_is_named(
-    demo: RGBDSequence, stage: str, corrupt: Callable[[Any], Any], field: str
+    slam: CheckedSLAM, demo: RGBDSequence, stage: str, corrupt: Callable[[Any], Any], field: str
 ) -> None:
     """The stages that use it hold the same wrapper."""
-    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
-    for index in range(3):
-        slam(demo[index])
-    last_poses, wrapper = follow_refinement(slam), getattr(slam, stage)
+    wrapper = getattr(slam, stage)
     original = wrapper._stage
 
     def corrupted(*args: Any, **kwargs: Any) -> Any:
@@ -191,10 +194,7 @@ def test_stage_used_by_other_stages_that_returns_nan_is_named(
 
     vars(corrupted)["refine"] = getattr(original, "refine", None)  # with which `track_map` refines the previous frame
     wrapper._stage = corrupted
-    with pytest.raises(NumericsError, match=rf"^frame 3: {re.escape(field)} is NaN"):
-        slam(demo[3])
-    assert len(slam.poses) == 3
-    assert torch.equal(slam.poses.T_cw, last_poses[-1])
+    assert_error_in_frame_3(slam, demo, field)
 
 
 def test_infinite_box_is_attributed_to_the_segmenter(demo: RGBDSequence) -> None:
@@ -279,6 +279,7 @@ def test_checked_recorded_images_give_the_same_results(real_sequence: Callable[[
     assert plain == checked
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_with_check_ends_at_nan_and_keeps_the_frames_before(demo: RGBDSequence, tmp_path: Path) -> None:
     def segment(frame: RGBDFrame) -> Instances:
         return replace(Instances.empty(480, 640), boxes=torch.full((frame.index // 2, 4), math.nan))

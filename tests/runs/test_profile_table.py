@@ -39,7 +39,7 @@ def test_heading_of_the_fraction_names_the_time() -> None:
     assert "┃ CPU ┃ fraction of CPU ┃" in printed(0.04)
 
 
-def test_stages_in_turn_tell_the_time_outside_of_them() -> None:
+def test_time_outside_of_stages_in_turn_is_printed() -> None:
     text = printed(0.0885)
     assert "88.5 ms of wall time per frame, of which 21.5 ms outside the stages" in text
     assert "overlap" not in text and "limits" not in text

@@ -317,7 +317,7 @@ def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> N
         (Readout(0.008, 1e4), "0.0080 s; the images determine it only with a standard deviation of 0.0100 s"),
     ],
 )
-def test_log_says_whether_the_images_tell_the_readout(readout: Readout, text: str) -> None:
+def test_log_states_whether_the_images_determine_the_readout(readout: Readout, text: str) -> None:
     config = Config().rolling_shutter
     assert describe_readout(readout, config) == text
     assert describe_readout(readout, config.model_copy(update={"enabled": False})) == "not compensated"

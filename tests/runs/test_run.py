@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import pipeline as pipeline_module
+from v3d_torch.pipeline.run_record import RunRecord
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.report_page import render_page
 from v3d_torch.runs.request import RunRequest
@@ -47,6 +49,7 @@ def test_poses_and_sparse_map_are_written_before_the_point_map_is_fused(
     assert failure == f"killed or still running after {FRAMES} of {FRAMES} frames"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_poses_and_tables_are_collected_and_written_once_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,6 +74,7 @@ class WallWithoutDepth(Wall):
         return RGBDFrame(frame.index, frame.stamp, frame.image, torch.zeros_like(frame.depth))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_more_landmarks_than_features_are_the_cause_of_a_lost_camera(moment: Path, tmp_path: Path) -> None:
     config = load_config(overrides=["mapping.min_tracked=900", "features.count=300"])
     run = Run(RunRequest("moment", config), load_sequence(str(moment)), MaskFolder(moment / "masks"), tmp_path)
@@ -93,6 +97,7 @@ def test_run_that_never_finds_the_camera_stores_the_cause_and_no_scores(
     assert "ATE RMSE" not in page and "The camera was not found in any frame" in page
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_that_ended_early_has_no_diagnosis(tmp_path: Path) -> None:
     """The frames that it lacks could be different."""
 
@@ -104,6 +109,21 @@ def test_run_that_ended_early_has_no_diagnosis(tmp_path: Path) -> None:
     run(interrupt)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["failure"] == f"interrupted after 4 of {FRAMES} frames" and metrics["diagnosis"] is None
+
+
+RunWall = Callable[..., RunRecord]
+
+
+@pytest.fixture
+def run_wall(undrawn: None, tmp_path: Path) -> RunWall:
+    """Function that runs a sequence without figures and returns the record of the run."""
+
+    def run_sequence(sequence: Wall, segment: Segmenter = square, overrides: tuple[str, ...] = ()) -> RunRecord:
+        run = Run(RunRequest("wall", load_config(overrides=overrides)), sequence, segment, tmp_path)
+        run(lambda *_: None)
+        return run.pipeline.record
+
+    return run_sequence
 
 
 class Covered(StoredWall):
@@ -119,10 +139,9 @@ class Covered(StoredWall):
 
 
 @pytest.mark.parametrize("frames", [1, 6])
-def test_cause_of_the_loss_of_most_frames_is_a_warning(tmp_path: Path, frames: int) -> None:
+def test_cause_of_the_loss_of_most_frames_is_a_warning(run_wall: RunWall, tmp_path: Path, frames: int) -> None:
     """The cause is that of the lost frames; it is no error, because the poses of the others are right."""
-    run = Run(RunRequest("wall", Config()), Covered(frames), square, tmp_path)
-    run(lambda *_: None)
+    run_wall(Covered(frames))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     text = f"{FRAMES - frames} of {FRAMES} frames are lost: the colour images are uniform;"
     assert sum(warning.startswith(text) for warning in metrics["warnings"]) == 1 and metrics["diagnosis"] is None
@@ -195,12 +214,10 @@ def whole_image(frame: RGBDFrame) -> Instances:
     ids=["far", "partly dark and partly far", "small images"],
 )
 def test_diagnosis_names_the_cause_of_a_lost_camera(
-    sequence: Wall, segment: Segmenter, overrides: tuple[str, ...], cause: str, tmp_path: Path
+    sequence: Wall, segment: Segmenter, overrides: tuple[str, ...], cause: str, run_wall: RunWall
 ) -> None:
-    run = Run(RunRequest("wall", load_config(overrides=list(overrides))), sequence, segment, tmp_path)
-    run(lambda *_: None)
     expected = f"wall: the camera was not found in any of the {FRAMES} frames, {cause}"
-    assert str(run.pipeline.record.diagnosis).startswith(expected)
+    assert str(run_wall(sequence, segment, overrides).diagnosis).startswith(expected)
 
 
 def late_square(frame: RGBDFrame) -> Instances:
@@ -220,21 +237,17 @@ def static_square(frame: RGBDFrame) -> Instances:
     ],
 )
 def test_objects_are_the_cause_only_if_they_are_in_most_of_the_lost_frames(
-    segment: Segmenter, cause: str, tmp_path: Path
+    segment: Segmenter, cause: str, run_wall: RunWall
 ) -> None:
-    run = Run(RunRequest("wall", Config()), Unrelated(), segment, tmp_path)
-    run(lambda *_: None)
-    assert any(f" of {FRAMES} frames are lost: {cause}" in each for each in run.pipeline.record.warnings)
+    warnings = run_wall(Unrelated(), segment).warnings
+    assert any(f" of {FRAMES} frames are lost: {cause}" in each for each in warnings)
 
 
-def test_depth_that_is_too_far_is_the_cause_also_behind_a_person(tmp_path: Path) -> None:
-    run = Run(RunRequest("wall", Config()), FarBehindNear(), left_third, tmp_path)
-    run(lambda *_: None)
+def test_depth_that_is_too_far_is_the_cause_also_behind_a_person(run_wall: RunWall) -> None:
+    warnings = run_wall(FarBehindNear(), left_third).warnings
     cause = f"frames are lost: most depth is beyond {Config().features.max_depth:g} m; correct the camera's depth_scale"
-    assert any(cause in each for each in run.pipeline.record.warnings)
+    assert any(cause in each for each in warnings)
 
 
-def test_loss_of_few_frames_has_no_warning(tmp_path: Path) -> None:
-    run = Run(RunRequest("wall", Config()), Covered(FRAMES - 4), square, tmp_path)
-    run(lambda *_: None)
-    assert not any("are lost" in warning for warning in run.pipeline.record.warnings)
+def test_loss_of_few_frames_has_no_warning(run_wall: RunWall) -> None:
+    assert not any("are lost" in warning for warning in run_wall(Covered(FRAMES - 4)).warnings)

@@ -21,39 +21,39 @@ from v3d_torch.segmentation.weights import sha256_of
 @pytest.fixture
 def malicious(tmp_path: Path) -> tuple[Path, Path]:
     """File that creates another file when it is loaded without restrictions, and that file."""
-    path, victim = tmp_path / "malicious.pt", tmp_path / "victim"
-    torch.save({"model": CreatesFile(victim)}, path)
-    return path, victim
+    path, created = tmp_path / "malicious.pt", tmp_path / "created"
+    torch.save({"model": CreatesFile(created)}, path)
+    return path, created
 
 
 def test_malicious_file_is_effective_without_restrictions(malicious: tuple[Path, Path]) -> None:
-    path, victim = malicious
+    path, created = malicious
     torch.load(path, weights_only=False)
-    assert victim.is_file()
+    assert created.is_file()
 
 
 def test_names_that_are_not_allowed_are_rejected_despite_correct_checksum(malicious: tuple[Path, Path]) -> None:
-    path, victim = malicious
+    path, created = malicious
     with pytest.raises(WeightsError, match=r"malicious\.pt: cannot be read safely"):
         read_pt_weights(path, sha256_of(path))
-    assert not victim.exists()
+    assert not created.exists()
 
 
 @pytest.mark.parametrize(
     "content",
     [
-        b"cbuiltins\neval\n(V__import__('os').mkdir('{victim}')\ntR.",
+        b"cbuiltins\neval\n(V__import__('os').mkdir('{created}')\ntR.",
         b"cbuiltins\ngetattr\n(cbuiltins\n__import__\nVsystem\ntR.",
         b"not a pickle at all",
         b"",
     ],
 )
 def test_other_pickles_and_arbitrary_bytes_are_rejected(tmp_path: Path, content: bytes) -> None:
-    path, victim = tmp_path / "invalid.pt", tmp_path / "victim"
-    path.write_bytes(content.replace(b"{victim}", str(victim).encode()))
+    path, created = tmp_path / "invalid.pt", tmp_path / "created"
+    path.write_bytes(content.replace(b"{created}", str(created).encode()))
     with pytest.raises(WeightsError, match=r"invalid\.pt"):
         read_pt_weights(path, sha256_of(path))
-    assert not victim.exists()
+    assert not created.exists()
 
 
 def test_checksum_is_verified_before_unpickling(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

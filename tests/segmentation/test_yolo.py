@@ -158,24 +158,32 @@ def test_images_that_are_not_rgb_in_uint8_are_rejected(convert: Callable[[Tensor
         segmenter.segment(convert(photograph("astronaut")))  # type: ignore[arg-type]
 
 
-def test_network_is_exported_once_for_each_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Network for images of 64 x 96 pixels, exported into a cache of its own."""
+    weights = find_weights("yolo26n-seg")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("V3D_CACHE", str(tmp_path_factory.mktemp("cache")))
+        return exported_path("yolo26n-seg", weights, 64, 96)
+
+
+def test_network_is_exported_once_for_each_size(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    weights, stamp = find_weights("yolo26n-seg"), exported.stat().st_mtime_ns
+    monkeypatch.setenv("V3D_CACHE", str(exported.parents[1]))
+    assert exported_path("yolo26n-seg", weights, 64, 96) == exported
+    assert exported.stat().st_mtime_ns == stamp
+    assert exported_path("yolo26n-seg", weights, 96, 64) != exported
+    assert torch.get_default_dtype() == torch.float32
+
+
+def test_exported_network_does_not_depend_on_the_default_dtype(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     weights = find_weights("yolo26n-seg")
     monkeypatch.setenv("V3D_CACHE", str(tmp_path))
-    first = exported_path("yolo26n-seg", weights, 64, 96)
-    stamp = first.stat().st_mtime_ns
-    assert exported_path("yolo26n-seg", weights, 64, 96) == first
-    assert first.stat().st_mtime_ns == stamp
-    assert exported_path("yolo26n-seg", weights, 96, 64) != first
-
-
-def test_exported_network_does_not_depend_on_the_default_dtype(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    weights, written = find_weights("yolo26n-seg"), []
-    for dtype in (torch.float32, torch.float64):
-        monkeypatch.setenv("V3D_CACHE", str(tmp_path / str(dtype)))
-        with default_dtype(dtype):
-            written.append(exported_path("yolo26n-seg", weights, 64, 96).read_bytes())
-            assert torch.get_default_dtype() == dtype
-    assert written[0] == written[1]
+    with default_dtype(torch.float64):
+        assert exported_path("yolo26n-seg", weights, 64, 96).read_bytes() == exported.read_bytes()
+        assert torch.get_default_dtype() == torch.float64
 
 
 def test_damaged_files_of_a_network_in_the_cache_are_written_again(

@@ -197,7 +197,7 @@ def test_times_that_are_not_kept_are_input_errors() -> None:
         states.at(1.7e18)
 
 
-def test_states_of_a_long_run_are_forgotten() -> None:
+def test_only_the_states_of_the_last_ten_seconds_are_kept() -> None:
     states = StateHistory()
     one = state(0.0)
     for n in range(3000):

@@ -108,7 +108,7 @@ VISION = {
 
 @pytest.mark.parametrize("vision", [np.eye(3), *map(np.array, VISION.values())], ids=["normal", *VISION])
 @pytest.mark.parametrize("colours", [MOTION_STATE_COLOURS, STATUS_COLOURS], ids=["motion states", "statuses"])
-def test_colours_can_be_told_apart_by_colour_blind_people(colours: dict[str, str], vision: np.ndarray) -> None:
+def test_colours_differ_for_colour_blind_people(colours: dict[str, str], vision: np.ndarray) -> None:
     seen = []
     for colour in colours.values():
         rgb = np.array(to_rgb(colour))

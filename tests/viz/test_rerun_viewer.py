@@ -487,6 +487,7 @@ def test_viewer_is_started_and_receives_the_run(
     wait_until(lambda: saved.is_file() and saved.stat().st_size > 10_000, timeout=20, what="the viewer saved the run")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_command_without_screen_suggests_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy_frames(tmp_path / "three", range(45, 48))
     for name in list(os.environ):

@@ -332,6 +332,7 @@ def test_missing_rosbags_is_an_input_error(tmp_path: Path, monkeypatch: pytest.M
 # --- the command
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_run_on_a_bag_of_the_demo_is_accurate(tmp_path: Path) -> None:
     """Run the command on ten frames of the demo as a ROS 1 bag."""
     copy_frames(tmp_path / "folder", range(10))
