@@ -70,6 +70,8 @@ def test_existing_file_and_unknown_sequence_are_errors(sequence: Path, tmp_path:
     assert_error_line(
         call("--seq", sequence, "--out", tmp_path / "camera.yaml"), "already exists; choose another file with --out"
     )
+    (tmp_path / "loop.yaml").symlink_to("loop.yaml")
+    assert_error_line(call("--seq", sequence, "--out", tmp_path / "loop.yaml"), "loop.yaml: already exists")
     assert_error_line(call("--seq", "gone_folder", "--out", tmp_path / "new.yaml"), "gone_folder")
     assert not (tmp_path / "new.yaml").exists()
 

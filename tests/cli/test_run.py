@@ -372,6 +372,8 @@ def test_8_bit_depth_is_rejected(copy: Path, tmp_path: Path) -> None:
         ("masks/1.0.png", "would be written while it is read"),
         ("map_masks/1.0.png", "would be written while it is read"),
         ("map.ply", "exists and was not written by a run"),
+        ("runs.parquet", "out: contains a batch; choose another folder with --out"),
+        ("ablation.csv", "out: contains an ablation study; choose another folder with --out"),
     ],
 )
 def test_unsuitable_result_folder_leaves_no_recording(file: str, words: str, sequence: Path, tmp_path: Path) -> None:

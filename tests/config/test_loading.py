@@ -48,6 +48,11 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("depth.wxyz=2", "unknown key depth.wxyz; choose from kernel_size, sigma, edge_ratio"),
         ("features.count=true", "features.count: input should be a number, got True"),
         ("segmentation.source=no", "input should be 'yolo', 'masks' or 'none', got False"),
+        (
+            "segmentation.source=my:Cls",
+            "not yolo, masks or none; for a segmenter by import path, set stages.segment=my:Cls",
+        ),
+        ("segmentation.source={a: 1}", "input should be 'yolo', 'masks' or 'none', got {'a': 1}"),
         ("depth.sigma=yes", "depth.sigma: input should be a number, got True"),
         ("depth.kernel_size=true", "depth.kernel_size: input should be a number, got True"),
         ("objects.voting.time_spans=[0, true]", "time_spans: input should be a number, got [0, True]"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -70,7 +71,7 @@ def main(
         return load_sequence(seq, data_root=data_root, camera=camera, options=options)
 
     with exit_on_error():
-        if out.exists():
+        if os.path.lexists(out):  # also a link that leads nowhere, which the file would replace
             raise OutputError(f"{out}: already exists; choose another file with --out")
         check_writable(out)
         config = load_config(overrides=overrides)

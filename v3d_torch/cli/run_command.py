@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from v3d_torch.batch.batch_record import RUNS_TABLE, STUDY_TABLE
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
@@ -249,12 +250,15 @@ def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> No
     """Check that a run would overwrite neither the masks that it reads nor files of the user.
 
     Raises:
-        OutputError: If it would.
+        OutputError: If it would, or if a new run would mix its results with those of a batch or an ablation study.
     """
     written = [os.path.realpath(folder / name) for name in (MASKS, MAP_MASKS)]  # also of a loop of links
     if masks is not None and os.path.realpath(masks) in written:
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if not is_resumed:
+        for table, contents in ((RUNS_TABLE, "a batch"), (STUDY_TABLE, "an ablation study")):
+            if (folder / table).is_file():
+                raise OutputError(f"{folder}: contains {contents}; choose another folder with --out")
         find_earlier_results(folder)
 
 

@@ -168,6 +168,11 @@ def _check_tree(tree: Mapping[Any, Any], section: type[Section], source: str, pr
             if isinstance(value, Mapping):
                 _check_tree(value, field.annotation, source, f"{prefix}{key}.")
             continue
+        if f"{prefix}{key}" == "segmentation.source" and isinstance(value, str) and ":" in value:
+            raise ConfigError(
+                f"{source}: segmentation.source: {value} is not yolo, masks or none; for a segmenter by import path,"
+                f" set stages.segment={value}"
+            )
         values = value if isinstance(value, Sequence) else (value,)
         if type(field.default) in (int, float, tuple) and any(isinstance(each, bool) for each in values):
             raise ConfigError(f"{source}: {prefix}{key}: input should be a number, got {value!r}")
