@@ -12,6 +12,7 @@ from torch import Tensor
 
 from v3d_torch import V3DSLAM, PinholeCamera, RGBDFrame
 from v3d_torch.config.loading import load_config
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.types import TrackingStatus
 
@@ -86,3 +87,17 @@ def test_back_projected_images_of_a_lens_lie_on_the_walls(lens: PinholeCamera) -
     points = (depth[0, :, :, None] * lens.rays).abs()
     distance = (points - torch.tensor([1.7, 1.3, 2.4])).abs().amin(dim=-1)
     assert distance.max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        PinholeCamera(130, 130, 320, 240, distortion=(0, 0, 0, 0), distortion_model="equidistant"),
+        PinholeCamera(285, 286, 424, 400, 848, 800, (-0.0085, 0.046, -0.043, 0.0083), distortion_model="equidistant"),
+        PinholeCamera(500, 500, 320, 240, distortion=(-0.131, -0.585, 0.003, -0.001, 0.164)),
+    ],
+    ids=["more than 180 degrees", "corners beside the image circle", "polynomial that folds back"],
+)
+def test_camera_with_pixels_without_a_ray_is_rejected(camera: PinholeCamera) -> None:
+    with pytest.raises(InputError, match=r"lens model of the camera gives some of the .* pixels no ray .*; crop"):
+        V3DSLAM(camera, config=load_config(None, ("segmentation.source=none",)))

@@ -104,6 +104,7 @@ class V3DSLAM(FramePreprocessor):
         WeightsError: If the weights of the network are not available.
         ConfigError: If a parameter has the wrong type, or if a stage that the configuration names by its import path
             cannot be made, see `StagesConfig`.
+        InputError: If the lens model of the camera maps no ray in front of the camera to some pixels.
     """
 
     def __init__(

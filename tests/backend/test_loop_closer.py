@@ -215,6 +215,34 @@ def test_loop_correction_is_as_accurate_after_both_ends_of_an_earlier_loop_were_
     assert camera.errors().max() < 1.2 * closed.errors().max()
 
 
+def test_earlier_loop_with_culled_ends_holds_after_the_bundle_adjustment_moved_their_references(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A bundle adjustment moves active keyframes only; here it moves all of them alike, which changes no edge."""
+    camera, room = Camera(), Room(seed=1)
+    for k in range(41):
+        camera.step(room, lap_pose(k))
+    cull_keyframes(camera.map, {end: end + 1 for loop in camera.map.loops for end in (loop.i, loop.j)})
+    shift = se3_exp(torch.tensor([0.1, 0.05, -0.1, 0.02, 0.03, -0.02], dtype=torch.float64))
+    active = torch.tensor([not keyframe.is_culled for keyframe in camera.map.keyframes] + [True] * 7)
+    detect, compared = camera.loop_closer.detect_loop, 0
+
+    def detect_twice(keyframe: Keyframe, sparse_map: SparseMap, T_cw: Tensor) -> LoopCorrection | None:
+        nonlocal compared
+        rows = active[: len(T_cw)]
+        moved = detect(keyframe, sparse_map, torch.where(rows[:, None, None], T_cw @ shift, T_cw))
+        correction = detect(keyframe, sparse_map, T_cw)
+        if correction is not None and moved is not None:
+            torch.testing.assert_close(moved.T_cw[rows], correction.T_cw[rows] @ shift, rtol=0, atol=1e-6)
+            compared += 1
+        return correction
+
+    monkeypatch.setattr(camera.loop_closer, "detect_loop", detect_twice)
+    for k in range(41, 2 * LAP):
+        camera.step(room, lap_pose(k))
+    assert compared == 1
+
+
 def test_convention_correction_maps_old_world_to_new_world() -> None:
     camera, room = Camera(), Room(seed=1)
     # Without loop closing, the newest keyframe keeps the pose that it had before the correction.

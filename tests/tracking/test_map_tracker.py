@@ -18,6 +18,7 @@ from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 COUNT = 400
 TUM_LENS = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
 LENS = PinholeCamera(fx=517.3, fy=516.5, cx=318.6, cy=255.3, distortion=TUM_LENS)
+FISHEYE = PinholeCamera(260, 262, 317.4, 240.4, distortion=(-0.01, 0.02, -0.01, 0.002), distortion_model="equidistant")
 SIDEWAYS = se3_exp(torch.tensor([0.02, -0.01, 0.01, 0.005, 0.01, -0.01], dtype=torch.float64))
 
 
@@ -90,3 +91,17 @@ def test_landmarks_occluded_for_many_frames_are_culled_only_without_depth(with_d
     active = wall.map.landmarks["active"][wall.first.landmarks]
     assert active[~left].all()
     assert active[left].all() if with_depth else not active[left].any()
+
+
+@pytest.mark.parametrize("with_depth", [False, True])
+def test_landmarks_that_a_wide_lens_does_not_record_are_not_visible(with_depth: bool) -> None:
+    wall = MappedWall(FISHEYE)
+    turned = se3_exp(torch.tensor([0, 0, 0, 0, 0.9, 0], dtype=torch.float64))  # landmarks on the right leave the image
+    in_camera = wall.camera.back_project(wall.features.uv, wall.features.depth) @ turned[:3, :3].T
+    uv, z = FISHEYE.project(in_camera), in_camera[:, 2]
+    pixel = FISHEYE.distort(uv)
+    inside = in_image(pixel) & (z > 0.05)
+    assert 50 < inside.sum() < COUNT - 50
+    observed = Features(uv, pixel.round().long(), z, wall.features.octave, wall.features.descriptors)[inside]
+    tracking = wall.track(observed, turned, torch.zeros(1, 480, 640) if with_depth else None)
+    assert set(tracking.visible.tolist()) == set(wall.first.landmarks[inside].tolist())

@@ -117,7 +117,7 @@ class LoopCloser(StatefulComponent):
             keyframe: Newest keyframe.
             sparse_map: Map of the keyframe.
             T_cw: World-to-camera poses of all keyframes, from which the edges of the pose graph other than loops are
-                computed, float64, shape :math:`(K, 4, 4)`.
+                computed, float64, shape :math:`(K, 4, 4)`; those of culled keyframes are ignored.
 
         Returns:
             The loop and corrected poses; None if there is no loop or loop closing is disabled.
@@ -179,7 +179,9 @@ class LoopCloser(StatefulComponent):
         reference = sparse_map.references
         i, j = torch.tensor([[loop.i, loop.j] for loop in loops]).unbind(dim=1)
         # Transfer each loop to active keyframes: a culled keyframe keeps its pose relative to its reference keyframe.
-        T_reference_i, T_j_reference = T_cw[reference[i]] @ invert(T_cw[i]), T_cw[j] @ invert(T_cw[reference[j]])
+        # The adjustment in T_cw did not move culled keyframes, so their relative poses are those of the map.
+        old = sparse_map.T_cw
+        T_reference_i, T_j_reference = old[reference[i]] @ invert(old[i]), old[j] @ invert(old[reference[j]])
         T_loop = T_reference_i @ torch.stack([loop.T_ij for loop in loops]) @ T_j_reference
         active, node = reference.unique(return_inverse=True)
         loop_edges = torch.stack([node[i], node[j]], dim=1)

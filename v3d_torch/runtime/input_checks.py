@@ -20,6 +20,10 @@ from v3d_torch.types import Instances, RGBDFrame
 _MAX_NORM_ERROR = 1e-3
 """Maximum difference between the length of a unit vector and 1."""
 
+_MAX_TANGENT = 20.0
+"""Maximum tangent of the angle between a viewing ray and the optical axis, that of 87 degrees. Undistorted positions
+grow with the tangent. Where a lens model maps no ray to a pixel, the ray is arbitrary, mostly beyond this angle."""
+
 
 class TensorSpec(NamedTuple):
     """Expected dtype, shape and values of a tensor.
@@ -45,10 +49,11 @@ INSTANCES: Mapping[str, TensorSpec] = {
 
 
 def check_parameters(camera: object, segment: object, config: object) -> None:
-    """Check the types of the parameters of `V3DSLAM`.
+    """Check the types of the parameters of `V3DSLAM`, and the field of view of the camera.
 
     Raises:
         ConfigError: If a parameter has the wrong type.
+        InputError: If the lens model of the camera maps no ray in front of the camera to some pixels.
     """
     if not isinstance(camera, PinholeCamera):
         found = describe_type(camera)
@@ -59,6 +64,12 @@ def check_parameters(camera: object, segment: object, config: object) -> None:
     if not isinstance(config, Config | None):
         found = describe_type(config)
         raise ConfigError(f'V3DSLAM needs a Config, got {found}; give one, such as load_config("paper")')
+    if not bool((camera.rays[..., :2].norm(dim=-1) <= _MAX_TANGENT).all()):  # also true for NaN
+        raise InputError(
+            f"the {camera.distortion_model} lens model of the camera gives some of the {camera.width} x {camera.height}"
+            " pixels no ray within 87 degrees of the optical axis; crop the images, and subtract the offset of the crop"
+            " from cx and cy, or correct focal lengths and distortion"
+        )
 
 
 def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:

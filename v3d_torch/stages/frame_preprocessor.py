@@ -45,6 +45,7 @@ class FramePreprocessor(ReplaceableStages):
     Raises:
         WeightsError: If the weights of the network are not available.
         ConfigError: If a parameter has the wrong type.
+        InputError: If the lens model of the camera maps no ray in front of the camera to some pixels.
     """
 
     def __init__(self, camera: PinholeCamera, segment: Segmenter | None, config: Config | None) -> None:

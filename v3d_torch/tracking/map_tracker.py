@@ -103,7 +103,7 @@ class MapTracker:
             return None
         ids = torch.full((len(features),), -1, dtype=torch.int64)
         ids[feature[refined.inliers]] = local_map.ids[landmark[refined.inliers]]
-        visible = projected.indices if depth is None else projected.indices[~self._is_occluded(projected, depth)]
+        visible = projected.indices[self._is_visible(projected, depth)]
         return MapTracking(refined.T_cw, ids, local_map.ids[visible], refined.information)
 
     def refine(self, T_cw: Tensor, points: Tensor, features: Features, *, rounds: int) -> PoseRefinement | None:
@@ -125,8 +125,18 @@ class MapTracker:
         refined = refine_pose_unchecked(T_cw, points, measured, self._camera.K, rounds=rounds)
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 
-    def _is_occluded(self, projected: ProjectedLandmarks, depth: Tensor) -> Tensor:
-        """Return the mask of the landmarks behind the measured depth at their projection, bool, shape (V,)."""
-        pixels = self._camera.distort(projected.uv).round().to(torch.int64)
-        z = sample_depth(pixels, depth, torch.inf)
-        return (z > 0) & (1 / z - 1 / projected.depth > _OCCLUSION_SIGMAS * self._config.inverse_depth_sigma)
+    def _is_visible(self, projected: ProjectedLandmarks, depth: Tensor | None) -> Tensor:
+        """Return the mask of the landmarks in the image, and not behind the measured depth, bool, shape (V,).
+
+        Landmarks are matched in the undistorted image. Where it is larger than the recorded image, as for a wide lens,
+        landmarks outside the recorded image cannot be observed; see `PinholeCamera.undistorted_bounds`.
+        """
+        pixels = self._camera.distort(projected.uv)
+        size = pixels.new_tensor([self._camera.width, self._camera.height])
+        in_recorded, in_undistorted = (((uv >= 0) & (uv < size)).all(dim=1) for uv in (pixels, projected.uv))
+        in_image = in_recorded | in_undistorted
+        if depth is None:
+            return in_image
+        z = sample_depth(pixels.round().to(torch.int64), depth, torch.inf)
+        is_occluded = (z > 0) & (1 / z - 1 / projected.depth > _OCCLUSION_SIGMAS * self._config.inverse_depth_sigma)
+        return in_image & ~is_occluded
