@@ -10,6 +10,7 @@ from threading import Event, Thread
 
 from v3d_torch.datasets.base import LiveStream, SkipsFrames
 from v3d_torch.errors import InputError
+from v3d_torch.io.timestamps import round_timestamp
 from v3d_torch.live.latest_queue import LatestQueue
 from v3d_torch.runtime.clock import Clock
 from v3d_torch.types import RGBDFrame
@@ -95,7 +96,7 @@ class FrameCapture:
 
     def _is_in_order(self, frame: RGBDFrame) -> bool:
         """Check whether a frame is later than all before; the first frame of several out of order is logged."""
-        if frame.stamp > self._newest_stamp:
+        if round_timestamp(frame.stamp) > round_timestamp(self._newest_stamp):
             self._newest_stamp, self._rejected_in_a_row = frame.stamp, 0
             return True
         if not self._rejected_in_a_row:
