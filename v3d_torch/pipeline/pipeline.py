@@ -13,6 +13,7 @@ import torch
 
 from v3d_torch.calibration.colour_order import check_colour_order
 from v3d_torch.calibration.exposure import check_exposure
+from v3d_torch.calibration.lens import check_lens
 from v3d_torch.calibration.people_size import apparent_sizes
 from v3d_torch.calibration.plausibility import check_plausibility
 from v3d_torch.datasets.base import HasMotionMasks, LiveStream, RGBDSequence, RGBDStream
@@ -151,6 +152,7 @@ class Pipeline:
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
+        self.warn(check_lens(self.slam.camera))
         self.warn([*check_exposure(self.views), *check_colour_order(self.views, self.slam.segment)])
         frames = len(self.slam.poses)
         self.warn(self.record.repeated.check(frames))
