@@ -11,7 +11,7 @@ from helpers.board_room import CAMERA, make_views
 from helpers.calibration_map import TRUE, make_map
 from torch import Tensor
 
-from v3d_torch.calibration.plausibility import check_plausibility
+from v3d_torch.calibration.plausibility import _check_depth_scale, check_plausibility
 from v3d_torch.config import Config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import STORED_UNIT
@@ -108,6 +108,17 @@ def test_steps_of_other_cameras_are_not_compared_with_a_kinect() -> None:
 def test_warning_about_depth_outside_the_range_of_cameras(scale: float, text: str) -> None:
     warnings = [each for each in check(*make_views(6, scale=scale)) if "depth_scale" in each]
     assert len(warnings) == 1 and warnings[0].endswith(f"the depth_scale 5000 seems to be {text}")
+
+
+def test_depth_of_large_images_is_checked() -> None:
+    """Four views have more pixels than `torch.quantile` accepts."""
+    camera = PinholeCamera(2100.0, 2100.0, 1055.5, 1023.5, 2112, 2048, depth_scale=5000.0)
+    metres = torch.linspace(0.1, 0.2, camera.width).expand(camera.height, -1)
+    large = StaticViews(camera, 1)
+    for view in make_views(4)[0]:
+        large.append(replace(view, depth_units=(metres / STORED_UNIT).round().to(torch.uint16)))
+    (warning,) = _check_depth_scale(large, camera)
+    assert warning.startswith("half of the depth is nearer than 0.15 m")
 
 
 def constant_views(constant: int, count: int, *, moving: bool = True) -> tuple[StaticViews, Trajectory]:

@@ -130,6 +130,21 @@ def test_p_values_of_true_parameters_are_uniform(known: float, groups: int) -> N
         assert sum(value < level for value in values) / len(values) == pytest.approx(level, abs=0.3 * level + 0.01)
 
 
+@pytest.mark.parametrize("groups", [4, 5, 6])
+def test_p_value_is_one_if_the_blocks_are_too_few_for_the_parameters(groups: int) -> None:
+    """Their covariance is singular: in some direction every difference would be significant, and in others NaN."""
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        factors = torch.randn(groups, 40, 6, generator=generator, dtype=torch.float64)
+        errors = torch.randn(groups, 40, generator=generator, dtype=torch.float64)
+        gradient = torch.einsum("kn,kni->ki", errors, factors)
+        hessian = torch.einsum("kni,knj->kij", factors, factors)
+        jackknife = jackknife_covariance(gradient, hessian)
+        assert jackknife.covariance.isfinite().all()
+        difference = minimum(gradient, hessian)
+        assert p_value(difference, jackknife.covariance, torch.zeros(6, 6).double(), jackknife.blocks) == 1.0
+
+
 @pytest.mark.parametrize(("groups", "blocks"), [(3, 3), (5, 5), (10, 10), (25, 10)])
 def test_number_of_blocks_is_returned(groups: int, blocks: int) -> None:
     gradient, hessian = make_groups(groups, seed=7)

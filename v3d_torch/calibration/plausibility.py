@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -127,7 +128,7 @@ def _check_constant_depth(views: StaticViews) -> list[str]:
     Only a plane has the same depth everywhere, and only from one direction.
     """
     examined = [view for view in _examined_views(views) if len(_measured(view)) >= _MIN_MEASURED]
-    ranges = [_measured(view).quantile(torch.tensor(_RANGE_QUANTILES)).tolist() for view in examined]
+    ranges = [np.quantile(_measured(view).numpy(), _RANGE_QUANTILES).tolist() for view in examined]
     constant = [view for view, (low, high) in zip(examined, ranges, strict=True) if low == high]
     if 2 * len(constant) <= len(examined):
         return []
@@ -158,7 +159,7 @@ def _check_depth_scale(views: StaticViews, camera: PinholeCamera) -> list[str]:
             f" their field of view, is one of them, the depth_scale {camera.depth_scale:g} is {error}; other cameras,"
             " such as stereo cameras, have other steps"
         ]
-    low, median, high = (float(depth.quantile(q)) for q in (0.01, 0.5, 0.99))
+    low, median, high = np.quantile(depth.numpy(), (0.01, 0.5, 0.99)).tolist()  # torch limits the number of values
     if low > _FAR[0] and high > _FAR[1]:
         return [
             f"the depth images range from {low:.2g} to {high:.2g} m, but RGB-D cameras measure up to about 10 m; the"

@@ -76,11 +76,14 @@ def p_value(difference: Tensor, covariance: Tensor, known: Tensor, blocks: int) 
         blocks: Number of blocks of the covariance.
 
     Returns:
-        From 0 to 1; NaN if the difference or the covariance is not finite.
+        From 0 to 1; 1 if there are not more blocks than parameters, whose covariance is then singular; NaN if the
+        difference or the covariance is not finite.
     """
     if not (difference.isfinite().all() and covariance.isfinite().all()):  # so is that of too few blocks
         return math.nan
     count, of_blocks = len(difference), blocks - 1  # degrees of freedom
+    if of_blocks < count:
+        return 1.0
     uncertain = covariance * ((of_blocks - 2) / of_blocks)
     weighted = torch.linalg.solve(uncertain + known, difference)
     squared = max(float(difference @ weighted), 0.0)
