@@ -153,6 +153,24 @@ def test_openexr_image_of_other_channels_or_size_is_rejected(tmp_path: Path) -> 
         read_depth_file(tmp_path / "a.exr")
 
 
+def test_openexr_image_with_many_channels_is_not_loaded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if it states a small size before the actual one, in another attribute."""
+    values = HEIGHT * WIDTH
+    monkeypatch.setattr("v3d_torch.datasets.depth_files._MAX_EXR_VALUES", 4 * values)
+    save_exr(tmp_path / "a.exr", dict.fromkeys("ZRGB", METRES))
+    assert np.array_equal(read_depth_file(tmp_path / "a.exr"), METRES)
+    save_exr(tmp_path / "a.exr", dict.fromkeys("ZRGBA", METRES))
+    with pytest.raises(InputError, match=r"a.exr: has more than .* values in its channels; export depth alone"):
+        read_depth_file(tmp_path / "a.exr")
+    library = pytest.importorskip("OpenEXR")
+    small = "dataWindow\0box2i\0\x10\0\0\0" + "\0" * 16
+    library.File({"a": small, "type": library.scanlineimage}, {"Z": METRES}).write(str(tmp_path / "a.exr"))
+    assert small.encode() in (tmp_path / "a.exr").read_bytes()
+    monkeypatch.setattr("v3d_torch.datasets.depth_files.MAX_PIXELS", values - 1)
+    with pytest.raises(InputError, match=r"a.exr: has more than .* million pixels"):
+        read_depth_file(tmp_path / "a.exr")
+
+
 def test_openexr_without_its_library_names_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.exr").write_bytes(b"v/1\x01dataWindow\0box2i\0\x10\0\0\0" + bytes(16))
     monkeypatch.setitem(sys.modules, "OpenEXR", None)

@@ -60,6 +60,25 @@ def test_file_that_unpacks_to_far_more_is_not_unpacked(tmp_path: Path) -> None:
         read(tmp_path / "file")
 
 
+@pytest.mark.parametrize("header", ["{'shape': (10,", "  a\n b", "'" + "''", "(" * 5000])
+def test_damaged_header_of_an_array_is_an_input_error(tmp_path: Path, header: str) -> None:
+    with zipfile.ZipFile(tmp_path / "file", "w") as archive:
+        archive.writestr("about.npy", b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode())
+    with pytest.raises(InputError, match=r"file: is not a test file or is damaged"):
+        read(tmp_path / "file")
+
+
+@pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_compression_that_numpy_does_not_write_is_an_input_error(tmp_path: Path, compression: int) -> None:
+    with zipfile.ZipFile(tmp_path / "file", "w", compression) as archive:
+        archive.writestr("about.npy", bytes(100))
+    content = bytearray((tmp_path / "file").read_bytes())
+    content[45:48] = bytes(3)  # in the compressed data
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(InputError, match=r"file: is not a test file or is damaged \(.*another compression"):
+        read(tmp_path / "file")
+
+
 def test_error_names_the_file_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="below: cannot be written"):

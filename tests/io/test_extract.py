@@ -47,12 +47,13 @@ def test_only_top_folder_is_stripped(tmp_path: Path, top: str) -> None:
         file_member("../outside"),
         file_member("seq/../../outside"),
         link_member("seq/link", "../../outside", tarfile.SYMTYPE),
+        link_member("seq/link", "rgb.txt", tarfile.SYMTYPE),
         link_member("seq/link", "/etc/passwd", tarfile.SYMTYPE),
         link_member("seq/link", "../outside", tarfile.LNKTYPE),
         link_member("seq/device", "", tarfile.CHRTYPE),
         link_member("seq/pipe", "", tarfile.FIFOTYPE),
     ],
-    ids=["parent", "parent inside", "symbolic link", "absolute link", "hard link", "device", "pipe"],
+    ids=["parent", "parent inside", "symbolic link", "link inside", "absolute link", "hard link", "device", "pipe"],
 )
 def test_members_outside_the_folder_and_special_files_are_rejected(
     tmp_path: Path, member: tuple[tarfile.TarInfo, bytes]
@@ -63,6 +64,24 @@ def test_members_outside_the_folder_and_special_files_are_rejected(
         extract_tar(archive, tmp_path / "box" / "seq")
     assert names_in(tmp_path) == ["a.tgz", "box"]
     assert names_in(tmp_path / "box") == []
+
+
+def test_chain_of_links_with_a_long_path_writes_nothing_outside(tmp_path: Path) -> None:
+    """The filter of Python before 3.11.13 and 3.12.11 does not resolve the links of a path of more than 4096 bytes."""
+    members, folder = [], ""
+    for name in "abcdefghijklmnop":
+        info = tarfile.TarInfo(f"{folder}{'d' * 247}")
+        info.type, info.mode = tarfile.DIRTYPE, 0o755
+        members += [(info, b""), link_member(f"{folder}{name}", "d" * 247, tarfile.SYMTYPE)]
+        folder += f"{'d' * 247}/"
+    long_link = f"{'/'.join('abcdefghijklmnop')}/{'l' * 254}"
+    members.append(link_member(long_link, "../" * 16, tarfile.SYMTYPE))
+    members += [link_member("escape", f"{long_link}/../..", tarfile.SYMTYPE), file_member("escape/outside")]
+    (tmp_path / "box").mkdir()
+    archive = write_archive(tmp_path / "a.tgz", *members)
+    with pytest.raises(InputError, match="is unsafe, a member leads outside or is not a plain file"):
+        extract_tar(archive, tmp_path / "box" / "seq")
+    assert names_in(tmp_path) == ["a.tgz", "box"]
 
 
 def test_absolute_names_are_extracted_inside_the_folder(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,15 @@ def test_damaged_state_file_is_rejected(tmp_path: Path) -> None:
             read_state(tmp_path / "s", [])
     with pytest.raises(InputError, match=r"cannot be read \(No such file"):
         read_state(tmp_path / "none", [])
+
+
+def test_damaged_objects_with_a_right_checksum_are_rejected(tmp_path: Path) -> None:
+    body = write_value(tmp_path / "s").split(b"\n", 2)[1] + b"\n"
+    for objects in (b"", b"\x80\x02J\x01", b"\x80\x02K\x01Q."):  # a number that is cut off; an id that is no tuple
+        digest = hashlib.sha256(body + objects).hexdigest()
+        (tmp_path / "s").write_bytes(f"v3d_torch state {VERSION} sha256 {digest}\n".encode() + body + objects)
+        with pytest.raises(InputError, match="/s: is damaged or not a state of a run"):
+            read_state(tmp_path / "s", [])
 
 
 def test_reading_runs_no_code_and_creates_allowed_classes_only(tmp_path: Path) -> None:

@@ -160,6 +160,12 @@ def test_unusable_id_images_are_rejected_by_path(tmp_path: Path) -> None:
         MaskFolder(tmp_path)(frame(0, 0.0))
 
 
+def test_id_image_that_would_fill_the_memory_is_not_decoded(tmp_path: Path) -> None:
+    Image.new("1", (8200, 8200)).save(tmp_path / "a.png")
+    with pytest.raises(InputError, match=r"a\.png: has more than 64 million pixels"):
+        MaskFolder(tmp_path)(frame(0, 0.0))
+
+
 def test_every_frame_of_a_real_sequence_has_an_id_image(real_sequence: Callable[[str], Path]) -> None:
     folder = real_sequence("crowd_static")
     pairs = [line.split() for line in (folder / "associations.txt").read_text().splitlines() if line[:1] != "#"]

@@ -37,3 +37,10 @@ def test_time_of_a_single_frame_is_drawn() -> None:
 def test_one_or_two_frames_are_drawn(frames: int) -> None:
     stamps = arc().stamps[:frames].tolist()
     assert embed_svg(draw_stages_over_time(stamps, {"read": np.ones(frames)}), "stages").startswith("<svg")
+
+
+def test_names_of_stages_are_not_formulas() -> None:
+    """They come from the files of a run, which can be damaged."""
+    name = r"$\frac{$"
+    assert embed_svg(draw_stage_bars({name: 0.1}), "stages").startswith("<svg")
+    assert embed_svg(draw_stages_over_time([0.0, 1.0], {name: np.ones(2)}), "stages").startswith("<svg")

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +21,8 @@ _EXR_CHANNELS = ("Z", "Y", "V", "R")
 """Channels of an OpenEXR file that can contain depth, as renderers write it: depth, brightness, value, red. The first
 channel that exists is read."""
 
-_EXR_HEADER_LENGTH = 1 << 16
-"""Number of bytes that are searched for the size of an OpenEXR image; the header of a depth image is much shorter."""
+_MAX_EXR_VALUES = 2 * MAX_PIXELS
+"""Maximum number of values in all channels of an OpenEXR file: half a gigabyte in 32 bits."""
 
 
 def read_depth_file(path: Path) -> NDArray[np.generic]:
@@ -66,15 +65,25 @@ def _read_npy(path: Path) -> NDArray[np.generic]:
 
 
 def _read_exr(path: Path) -> NDArray[np.generic]:
-    _check_exr_size(path)
+    try:
+        with path.open("rb"):
+            pass  # the library does not tell why it cannot open a file
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its name and permissions") from error
     try:
         library = importlib.import_module("OpenEXR")
     except ImportError as error:
         raise InputError(f"{path}: reading OpenEXR needs a library ({error}); run pip install OpenEXR") from error
     try:
+        with library.File(str(path), header_only=True) as file:
+            parts = [(part.header["dataWindow"], len(part.header["channels"])) for part in file.parts]
+    except Exception as error:  # the library raises RuntimeError and ValueError on invalid data
+        raise InputError(f"{path}: is truncated or not an OpenEXR image; copy or export it again") from error
+    _check_exr_size(path, parts)
+    try:
         with library.File(str(path), separate_channels=True) as file:
             channels = {name: channel.pixels for name, channel in file.channels().items()}
-    except Exception as error:  # the library raises RuntimeError and ValueError on invalid data
+    except Exception as error:
         raise InputError(f"{path}: is truncated or damaged; copy or download it again") from error
     # A layer is part of the name, as in "ViewLayer.Depth.Z".
     found = (pixels for wanted in _EXR_CHANNELS for name, pixels in channels.items() if name.split(".")[-1] == wanted)
@@ -84,19 +93,25 @@ def _read_exr(path: Path) -> NDArray[np.generic]:
     return np.asarray(depth)
 
 
-def _check_exr_size(path: Path) -> None:
-    """Check the size of an OpenEXR image by its header, because the library loads all pixels at once."""
-    try:
-        with path.open("rb") as file:
-            header = file.read(_EXR_HEADER_LENGTH)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its name and permissions") from error
-    _, found, window = header.partition(b"dataWindow\0box2i\0" + struct.pack("<i", 16))
-    if not found or len(window) < 16:
-        raise InputError(f"{path}: is truncated or not an OpenEXR image; copy or export it again")
-    left, top, right, bottom = struct.unpack("<4i", window[:16])
-    if (right - left + 1) * (bottom - top + 1) > MAX_PIXELS:
-        raise too_large_error(path)
+def _check_exr_size(path: Path, parts: Sequence[tuple[NDArray[np.int32], int]]) -> None:
+    """Check the size of an OpenEXR image, because the library loads all channels of all parts at once.
+
+    Args:
+        path: Path of the image.
+        parts: For each part, its first and last column and row, shape (2, 2), and its number of channels.
+    """
+    values = 0
+    for window, channels in parts:
+        (left, top), (right, bottom) = np.asarray(window).tolist()
+        pixels = (right - left + 1) * (bottom - top + 1)
+        if pixels > MAX_PIXELS:
+            raise too_large_error(path)
+        values += pixels * channels
+    if values > _MAX_EXR_VALUES:
+        raise InputError(
+            f"{path}: has more than {_MAX_EXR_VALUES >> 20} million values in its channels; export depth alone, in"
+            " metres, as the channel Z"
+        )
 
 
 _READERS: dict[str, Callable[[Path], NDArray[np.generic]]] = {".npy": _read_npy, ".exr": _read_exr}

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,9 @@ _MIN_UNPACKED_LIMIT = 1 << 28
 _MAX_UNPACKED_RATIO = 20
 """Additional bytes to which a file may unpack, relative to its size. Maps unpack to about three times their size."""
 
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Kinds of compression that NumPy writes."""
+
 _DAMAGE_ERRORS = (
     zipfile.BadZipFile,
     zlib.error,
@@ -35,6 +39,8 @@ _DAMAGE_ERRORS = (
     RuntimeError,
     OverflowError,
     MemoryError,
+    SyntaxError,
+    TokenError,
 )
 """Errors of zip archives, arrays and JSON with wrong or missing bytes."""
 
@@ -93,7 +99,7 @@ def open_array_file(path: Path, format_name: str, kind: str, fix: str) -> Iterat
     """
     try:
         with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-            _check_unpacked_size(archive, path.stat().st_size)
+            _check_members(archive, path.stat().st_size)
             about = json.loads(_read_array(archive, "about").tobytes())
             if about["format"] != format_name:
                 raise ValueError(f"its format is not {format_name!r}")
@@ -104,8 +110,10 @@ def open_array_file(path: Path, format_name: str, kind: str, fix: str) -> Iterat
         raise InputError(f"{path}: is not {kind} or is damaged ({error}); {fix}") from error
 
 
-def _check_unpacked_size(archive: zipfile.ZipFile, size: int) -> None:
-    """Raise ValueError if an archive of ``size`` bytes would unpack to far more bytes than any map."""
+def _check_members(archive: zipfile.ZipFile, size: int) -> None:
+    """Raise ValueError if NumPy did not write an archive, or its ``size`` bytes would unpack to far more than a map."""
+    if any(member.compress_type not in _COMPRESSIONS for member in archive.infolist()):
+        raise ValueError("it has another compression than deflate")
     unpacked = sum(member.file_size for member in archive.infolist())
     if unpacked > _MIN_UNPACKED_LIMIT + _MAX_UNPACKED_RATIO * size:
         raise ValueError(f"it would unpack to {unpacked} bytes from {size}")

@@ -44,7 +44,7 @@ def extract_tar(archive: Path, folder: Path, *, max_bytes: int = MAX_BYTES) -> N
         max_bytes: Largest total size of the extracted files, bytes.
 
     Raises:
-        InputError: If the archive is damaged, too large, or contains special files or paths that lead outside.
+        InputError: If the archive is damaged, too large, or contains links, special files or paths that lead outside.
         OutputError: If the folder exists or cannot be written.
     """
     if folder.exists():
@@ -76,13 +76,19 @@ def extract_tar(archive: Path, folder: Path, *, max_bytes: int = MAX_BYTES) -> N
 
 
 def _limit_members(tar: tarfile.TarFile, archive: Path, max_bytes: int) -> Iterator[tarfile.TarInfo]:
-    """Yield the members; raise before their total size or number exceeds the limit."""
+    """Yield the members; raise at a link, and before their total size or number exceeds the limit.
+
+    All links are rejected, because the filter of Python before 3.11.13 and 3.12.11 lets a chain of links with a long
+    path lead outside. No sequence has links.
+    """
     total = 0
     for count, member in enumerate(tar):
         total += member.size
         if total > max_bytes or count >= _MAX_MEMBERS:
             limit = f"{max_bytes} bytes" if total > max_bytes else f"{_MAX_MEMBERS} files"
             raise InputError(f"{archive}: is unsafe, it extracts to more than {limit}; get it from another source")
+        if member.issym() or member.islnk():
+            raise tarfile.SpecialFileError(member)
         yield member
 
 

@@ -13,7 +13,6 @@ import re
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import IO, Any, cast
 
 import torch
@@ -30,18 +29,6 @@ _FIRST_LINE = f"{_FORMAT} {{version}} sha256 {{digest}}\n"
 _PLACEHOLDER_DIGEST = "0" * hashlib.sha256().digest_size * 2
 
 _BLOCK_SIZE = 1 << 20
-
-_DAMAGE_ERRORS = (
-    UnpicklingError,
-    RuntimeError,
-    EOFError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-    MemoryError,
-)
-"""Exceptions that a damaged archive, or damaged objects in it, can raise while loading."""
 
 
 def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:
@@ -91,9 +78,11 @@ def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any
                 )
             with torch.serialization.safe_globals(list(classes)):
                 return metadata, torch.load(file, weights_only=True)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    except _DAMAGE_ERRORS as error:
+    except Exception as error:  # damaged objects can raise any exception
         raise _damage_error(path) from error
 
 

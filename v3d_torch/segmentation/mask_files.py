@@ -13,7 +13,9 @@ from PIL import Image
 from torch import Tensor
 
 from v3d_torch.datasets.image_files import list_images, stamp_in_name
+from v3d_torch.datasets.images import too_large_error
 from v3d_torch.errors import InputError
+from v3d_torch.io.image_file import MAX_PIXELS
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.safe_yaml import parse_yaml
 from v3d_torch.io.text_file import read_text
@@ -154,7 +156,11 @@ def _read_ids(path: Path) -> NDArray[Any]:
     """Values of an id image, whole numbers, shape (H, W); for an image with a palette, the palette indices."""
     try:
         with Image.open(path, formats=["PNG"]) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise too_large_error(path)
             values = np.asarray(image)
+    except InputError:
+        raise
     except Exception as error:  # decoders raise exceptions of many types on damaged files
         raise InputError(f"{path}: is not a readable PNG image; write it again") from error
     if values.ndim != 2:

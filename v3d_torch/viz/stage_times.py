@@ -26,7 +26,8 @@ def draw_stage_bars(seconds_per_frame: Mapping[str, float]) -> Figure:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     milliseconds = [1e3 * seconds for seconds in seconds_per_frame.values()]
-    bars = axes.barh(list(seconds_per_frame), milliseconds, color=_colours(seconds_per_frame))
+    bars = axes.barh(range(len(milliseconds)), milliseconds, color=_colours(seconds_per_frame))
+    axes.set_yticks(range(len(milliseconds)), list(seconds_per_frame), parse_math=False)  # names come from a file
     axes.bar_label(bars, fmt="%.1f", padding=3, fontsize="small")
     axes.invert_yaxis()
     axes.spines[["top", "right"]].set_visible(False)
@@ -52,7 +53,10 @@ def draw_stages_over_time(stamps: Sequence[float], seconds: Mapping[str, NDArray
     figure, (axes,) = make_time_axes(times, [1.9], extra_height=0.5)
     axes.stackplot(x, 1e3 * np.repeat(means, 2, axis=1), labels=list(seconds), colors=_colours(seconds), linewidth=0)
     axes.set(ylabel="time per frame [ms]", ylim=(0, None))
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=8, frameon=False, fontsize=8)
+    handles = axes.get_legend_handles_labels()
+    legend = figure.legend(*handles, loc="outside upper center", ncols=8, frameon=False, fontsize=8)
+    for text in legend.get_texts():
+        text.set_parse_math(False)
     return figure
 
 
