@@ -27,9 +27,8 @@ from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
     check_shapes,
-    check_weights,
     fill_indices,
-    fill_padding,
+    fill_weights,
     from_rows,
     mask_or_all,
     to_rows,
@@ -253,10 +252,7 @@ def _prepare(
         fixed = torch.arange(T_wc.shape[-3], device=device) == 0
     if information is None:
         information = identity.expand(count, 6, 6)
-    if weights is None:
-        weights = torch.ones(count, dtype=torch.float64, device=device)
-    else:
-        check_weights(weights, mask_or_all(valid, weights))
+    weights = fill_weights(weights, mask_or_all(valid, edges[..., 0]))
     T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
     edges = fill_indices("edges", edges, T_wc.shape[-3], None if valid is None else valid[..., None])
     if can_read(edges):
@@ -270,7 +266,6 @@ def _prepare(
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
     check_finite_arguments(T_wc=T_wc, T_ij=T_ij, information=information)
-    weights = fill_padding(weights, valid, 0.0)
     graph = _Graph(
         edges=edges.expand(*batch, count, 2),
         T_ji=invert(T_ij).expand(*batch, count, 4, 4),

@@ -20,7 +20,7 @@ from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
-from v3d_torch.runtime.batches import check_shapes, check_weights, fill_padding, mask_or_all
+from v3d_torch.runtime.batches import check_shapes, fill_padding, fill_weights, mask_or_all
 
 _MIN_PAIRS = 6
 """Minimum number of pairs: a sample of 5, and one more pair that can confirm its matrix."""
@@ -88,10 +88,7 @@ def essential_ransac(
         uv_a=(uv_a, "N", 2), uv_b=(uv_b, "N", 2), K=(K, 3, 3), weights=(weights, "N"), valid=(valid, "N")
     )
     valid = mask_or_all(valid, uv_a[..., 0]) & uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
-    if weights is None:
-        weights = torch.ones_like(uv_a[..., 0])
-    else:
-        check_weights(weights, valid)
+    weights = fill_weights(weights, valid)
     K = K.to(torch.float64)
     is_regular = torch.linalg.det(K.detach()).abs()[..., None] > 0  # false for NaN, too
     K = torch.where(is_regular[..., None], K, torch.eye(3, dtype=K.dtype, device=K.device))
@@ -100,7 +97,7 @@ def essential_ransac(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),
         b=_homogeneous(fill_padding(uv_b, row, 0.0).expand(*batch, -1, 2)),
         K_inverse=torch.linalg.inv(K).expand(*batch, 3, 3),
-        weights=fill_padding(weights, valid, 0.0).expand(*batch, -1),
+        weights=weights.expand(*batch, -1),
     )
     constant = EpipolarProblem(*(each.detach() for each in problem))
     with torch.no_grad():

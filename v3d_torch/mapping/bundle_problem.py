@@ -26,7 +26,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import check_finite_arguments, check_shapes, check_weights, fill_indices, fill_padding
+from v3d_torch.runtime.batches import check_finite_arguments, check_shapes, fill_indices, fill_weights
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -246,16 +246,12 @@ def prepare_bundle(
         fixed = torch.arange(T_cw.shape[-3], device=T_cw.device) == 0
     pose = fill_indices("pose", pose, T_cw.shape[-3], valid)
     point = fill_indices("point", point, points.shape[-2], valid)
-    if weights is None:
-        weights = torch.ones(pose.shape, dtype=torch.float64, device=uv.device)
-    else:
-        check_weights(weights, valid)
     each = (*batch, pose.shape[-1])  # observation
     problem = BundleProblem(
         scale=target.scale.expand(*batch, 3, -1),
         offset=target.offset.expand(*batch, 3, -1),
         thresholds=measured.chi2_threshold.expand(each),
-        weights=fill_padding(weights, valid, 0.0).expand(each),
+        weights=fill_weights(weights, valid).expand(each),
         pose=pose.expand(each),
         point=point.expand(each),
         fixed=fixed.expand(*batch, T_cw.shape[-3]),

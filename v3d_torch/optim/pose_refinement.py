@@ -40,7 +40,7 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
-from v3d_torch.runtime.batches import check_shapes, check_weights, fill_padding, to_rows
+from v3d_torch.runtime.batches import check_shapes, fill_padding, fill_weights, to_rows
 
 ITERATIONS = 5
 """Default maximum number of Levenberg-Marquardt steps in a round."""
@@ -228,17 +228,15 @@ def refine_pose(
     )
     finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
-    if weights is not None:
-        check_weights(weights, valid)
+    weights = fill_weights(weights, valid)
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     scale, offset = whiten(measured, K.to(torch.float64))
-    thresholds = measured.chi2_threshold
     problem = _Problem(
         points=fill_padding(points, valid[..., None], 0.0),
         scale=scale,
         offset=offset,
-        thresholds=thresholds,
-        weights=fill_padding(torch.ones_like(thresholds) if weights is None else weights, valid, 0.0),
+        thresholds=measured.chi2_threshold,
+        weights=weights,
         valid=valid,
     )
     initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)

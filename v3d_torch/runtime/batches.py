@@ -90,6 +90,19 @@ def check_weights(weights: Tensor, valid: Tensor) -> None:
         raise InputError("weights has an infinite value; give finite weights")
 
 
+def fill_weights(weights: Tensor | None, valid: Tensor) -> Tensor:
+    """Return weights in float64 after `check_weights`, with 0 for padding.
+
+    Args:
+        weights: Weights of the measurements; None for 1.
+        valid: Mask of the measurements that are not padding, bool, a shape that broadcasts.
+    """
+    if weights is None:
+        return valid.to(torch.float64)
+    check_weights(weights, valid)
+    return fill_padding(weights, valid, 0.0)
+
+
 def check_shapes(**arguments: tuple[Tensor | float | None, *tuple[int | str | None, ...]]) -> torch.Size:
     """Check the shapes of the arguments of a function, and return the broadcast shape of their batches.
 
