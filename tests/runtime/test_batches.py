@@ -7,11 +7,12 @@ from collections.abc import Callable
 import pytest
 import torch
 from helpers.box_room import CAMERA
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 import v3d_torch as v3d
 from v3d_torch.errors import InputError
-from v3d_torch.runtime.batches import common_batch
+from v3d_torch.runtime.batches import check_shapes, common_batch
 
 K = torch.tensor([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
 INDEX = torch.zeros(5, dtype=torch.int64)
@@ -79,3 +80,17 @@ def test_common_batch_is_the_broadcast_shape() -> None:
     a, b, c = torch.ones(2, 1, 5), torch.ones(3, 5, 3), torch.ones(7)
     assert common_batch(a=(a, 1), b=(b, 2), c=(c, 1), none=(None, 1), number=(0.5, 1)) == (2, 3)
     assert common_batch(c=(c, 1), number=(0.5, 0)) == ()
+
+
+def test_check_shapes_returns_the_batch_of_arguments_whose_named_sizes_are_equal() -> None:
+    uv, K = torch.zeros(2, 1, 5, 2), torch.zeros(3, 3)
+    sigma, valid = torch.tensor(1.0), torch.ones(3, 5, dtype=torch.bool)
+    assert check_shapes(uv=(uv, "N", 2), K=(K, 3, 3), sigma=(sigma, None), valid=(valid, "N"), none=(None, "N")) == (
+        2,
+        3,
+    )
+
+
+def test_check_shapes_rejects_a_named_size_that_differs() -> None:
+    with pytest.raises(ShapeError, match="expected 5, got 4"):
+        check_shapes(uv=(torch.zeros(5, 2), "N", 2), weights=(torch.ones(4), "N"))

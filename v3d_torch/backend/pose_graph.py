@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -27,10 +26,9 @@ from v3d_torch.optim.implicit import jacobian
 from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
-    check_weights,
-    common_batch,
+    check_shapes,
     fill_indices,
-    fill_padding,
+    fill_weights,
     from_rows,
     mask_or_all,
     to_rows,
@@ -115,24 +113,14 @@ def optimise_pose_graph(
     if robust is not None:
         check_positive(robust=robust)
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
-    KORNIA_CHECK_SHAPE(initial, ["*", "N", "4", "4"])
-    KORNIA_CHECK_SHAPE(measured, ["*", "E", "4", "4"])
-    KORNIA_CHECK_SHAPE(edges, ["*", str(measured.shape[-3]), "2"])
-    if information is not None:
-        KORNIA_CHECK_SHAPE(information, ["*", str(measured.shape[-3]), "6", "6"])
-    if fixed is not None:
-        KORNIA_CHECK_SHAPE(fixed, ["*", str(initial.shape[-3])])
-    for column in (weights, valid):
-        if column is not None:
-            KORNIA_CHECK_SHAPE(column, ["*", str(measured.shape[-3])])
-    batch = common_batch(
-        T_wc=(initial, 3),
-        edges=(edges, 2),
-        T_ij=(measured, 3),
-        information=(information, 3),
-        fixed=(fixed, 1),
-        weights=(weights, 1),
-        valid=(valid, 1),
+    batch = check_shapes(
+        T_wc=(initial, "N", 4, 4),
+        T_ij=(measured, "E", 4, 4),
+        edges=(edges, "E", 2),
+        information=(information, "E", 6, 6),
+        fixed=(fixed, "N"),
+        weights=(weights, "E"),
+        valid=(valid, "E"),
     )
     graph, start = _prepare(batch, initial, edges, measured, information, fixed, weights, valid, robust)
     with torch.no_grad():
@@ -264,10 +252,7 @@ def _prepare(
         fixed = torch.arange(T_wc.shape[-3], device=device) == 0
     if information is None:
         information = identity.expand(count, 6, 6)
-    if weights is None:
-        weights = torch.ones(count, dtype=torch.float64, device=device)
-    else:
-        check_weights(weights, mask_or_all(valid, weights))
+    weights = fill_weights(weights, mask_or_all(valid, edges[..., 0]))
     T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
     edges = fill_indices("edges", edges, T_wc.shape[-3], None if valid is None else valid[..., None])
     if can_read(edges):
@@ -281,7 +266,6 @@ def _prepare(
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
     check_finite_arguments(T_wc=T_wc, T_ij=T_ij, information=information)
-    weights = fill_padding(weights, valid, 0.0)
     graph = _Graph(
         edges=edges.expand(*batch, count, 2),
         T_ji=invert(T_ij).expand(*batch, count, 4, 4),

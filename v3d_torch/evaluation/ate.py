@@ -6,7 +6,6 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
@@ -15,7 +14,7 @@ from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import to_matrix
-from v3d_torch.runtime.batches import common_batch, fill_padding, mask_or_all
+from v3d_torch.runtime.batches import check_shapes, fill_padding, mask_or_all
 
 _MIN_PLANE_SPREAD = 1e-3
 """Minimum standard deviation of the positions along their second principal axis, metres. Positions with less spread do
@@ -84,11 +83,7 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
         InputError: If ``valid`` is not bool.
     """
     check_masks(valid=valid)
-    KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
-    KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
-    if valid is not None:
-        KORNIA_CHECK_SHAPE(valid, ["*", str(T_gc.shape[-3])])
-    common_batch(T_gc=(T_gc, 3), T_ec=(T_ec, 3), valid=(valid, 1))
+    check_shapes(T_gc=(T_gc, "N", 4, 4), T_ec=(T_ec, "N", 4, 4), valid=(valid, "N"))
     each = None if valid is None else valid[..., None, None]
     truth, estimate = fill_padding(T_gc, each, 0.0), fill_padding(T_ec, each, 0.0)
     errors = absolute_errors(truth, estimate, align(truth, estimate, valid))

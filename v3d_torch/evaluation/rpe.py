@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -16,7 +15,7 @@ from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.kernels.compiler import can_read
-from v3d_torch.runtime.batches import common_batch, mask_or_all
+from v3d_torch.runtime.batches import check_shapes, mask_or_all
 from v3d_torch.types import Trajectory
 
 
@@ -82,12 +81,7 @@ def rpe(
         ConfigError: If ``delta`` is not positive.
     """
     check_masks(valid=valid)
-    KORNIA_CHECK_SHAPE(T_gc, ["*", "N", "4", "4"])
-    KORNIA_CHECK_SHAPE(T_ec, ["*", str(T_gc.shape[-3]), "4", "4"])
-    KORNIA_CHECK_SHAPE(stamps, ["*", str(T_gc.shape[-3])])
-    if valid is not None:
-        KORNIA_CHECK_SHAPE(valid, ["*", str(T_gc.shape[-3])])
-    batch = common_batch(T_gc=(T_gc, 3), T_ec=(T_ec, 3), stamps=(stamps, 1), valid=(valid, 1))
+    batch = check_shapes(T_gc=(T_gc, "N", 4, 4), T_ec=(T_ec, "N", 4, 4), stamps=(stamps, "N"), valid=(valid, "N"))
     exists = mask_or_all(valid, stamps).expand(*batch, -1)
     order = torch.argsort(~exists, dim=-1, stable=True)  # padding last
     times = torch.where(exists, stamps.to(torch.float64), torch.inf).gather(-1, order)

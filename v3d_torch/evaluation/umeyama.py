@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
@@ -11,7 +10,7 @@ from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import differentiable_rotation, to_matrix
-from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, mask_or_all
+from v3d_torch.runtime.batches import check_shapes, check_weights, fill_padding, mask_or_all
 
 _SAME_PLACE = 1e-12
 """Largest distance of points at one place from their mean, as a fraction of their distance from the origin. Rounding of
@@ -52,12 +51,7 @@ def umeyama(
         InputError: If ``valid`` is not bool, or if a weight is negative, infinite or NaN.
     """
     check_masks(valid=valid)
-    KORNIA_CHECK_SHAPE(p, ["*", "N", "3"])
-    KORNIA_CHECK_SHAPE(q, ["*", str(p.shape[-2]), "3"])
-    for column in (weights, valid):
-        if column is not None:
-            KORNIA_CHECK_SHAPE(column, ["*", str(p.shape[-2])])
-    common_batch(p=(p, 2), q=(q, 2), weights=(weights, 1), valid=(valid, 1))
+    check_shapes(p=(p, "N", 3), q=(q, "N", 3), weights=(weights, "N"), valid=(valid, "N"))
     if weights is not None:
         check_weights(weights, mask_or_all(valid, weights))
     each = None if valid is None else valid[..., None]

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
@@ -21,7 +20,7 @@ from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels.compiler import can_read, to_array
-from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, mask_or_all
+from v3d_torch.runtime.batches import check_shapes, fill_padding, fill_weights, mask_or_all
 
 _MIN_PAIRS = 6
 """Minimum number of pairs: a sample of 5, and one more pair that can confirm its matrix."""
@@ -85,18 +84,11 @@ def essential_ransac(
     """
     check_masks(valid=valid)
     check_positive(threshold=threshold, iterations=iterations)
-    KORNIA_CHECK_SHAPE(uv_a, ["*", "N", "2"])
-    KORNIA_CHECK_SHAPE(uv_b, ["*", str(uv_a.shape[-2]), "2"])
-    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    for each in (weights, valid):
-        if each is not None:
-            KORNIA_CHECK_SHAPE(each, ["*", str(uv_a.shape[-2])])
-    batch = common_batch(uv_a=(uv_a, 2), uv_b=(uv_b, 2), K=(K, 2), weights=(weights, 1), valid=(valid, 1))
+    batch = check_shapes(
+        uv_a=(uv_a, "N", 2), uv_b=(uv_b, "N", 2), K=(K, 3, 3), weights=(weights, "N"), valid=(valid, "N")
+    )
     valid = mask_or_all(valid, uv_a[..., 0]) & uv_a.isfinite().all(dim=-1) & uv_b.isfinite().all(dim=-1)
-    if weights is None:
-        weights = torch.ones_like(uv_a[..., 0])
-    else:
-        check_weights(weights, valid)
+    weights = fill_weights(weights, valid)
     K = K.to(torch.float64)
     is_regular = torch.linalg.det(K.detach()).abs()[..., None] > 0  # false for NaN, too
     K = torch.where(is_regular[..., None], K, torch.eye(3, dtype=K.dtype, device=K.device))
@@ -105,7 +97,7 @@ def essential_ransac(
         a=_homogeneous(fill_padding(uv_a, row, 0.0).expand(*batch, -1, 2)),
         b=_homogeneous(fill_padding(uv_b, row, 0.0).expand(*batch, -1, 2)),
         K_inverse=torch.linalg.inv(K).expand(*batch, 3, 3),
-        weights=fill_padding(weights, valid, 0.0).expand(*batch, -1),
+        weights=weights.expand(*batch, -1),
     )
     constant = EpipolarProblem(*(each.detach() for each in problem))
     with torch.no_grad():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -14,7 +13,7 @@ from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import without_autocast
 from v3d_torch.kernels import descriptors as descriptor_kernels
 from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.runtime.batches import common_batch
+from v3d_torch.runtime.batches import check_shapes, common_batch
 
 MAX_HAMMING, MAX_RATIO = OdometryConfig().max_hamming, OdometryConfig().max_ratio
 """Default thresholds, those of the odometry section of the configuration."""
@@ -115,12 +114,7 @@ def match_descriptors(
     for name, descriptors in (("a", a), ("b", b)):
         if descriptors.dtype != torch.uint8:
             raise InputError(f"{name} has the type {descriptors.dtype}; give binary descriptors of type torch.uint8")
-    KORNIA_CHECK_SHAPE(a, ["*", "N", "D"])
-    KORNIA_CHECK_SHAPE(b, ["*", "M", str(a.shape[-1])])
-    for descriptors, valid in ((a, a_valid), (b, b_valid)):
-        if valid is not None:
-            KORNIA_CHECK_SHAPE(valid, ["*", str(descriptors.shape[-2])])
-    common_batch(a=(a, 2), b=(b, 2), a_valid=(a_valid, 1), b_valid=(b_valid, 1))
+    check_shapes(a=(a, "N", "D"), b=(b, "M", "D"), a_valid=(a_valid, "N"), b_valid=(b_valid, "M"))
     distance = _pairwise_hamming_distances(a, b)
     a_valid = distance.new_ones(a.shape[-2], dtype=torch.bool) if a_valid is None else a_valid
     b_valid = distance.new_ones(b.shape[-2], dtype=torch.bool) if b_valid is None else b_valid

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import cv2
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.features.p3p import solve_p3p
@@ -21,7 +20,7 @@ from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
 from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
 from v3d_torch.optim.reprojection import CHI2_THRESHOLD_2D, MIN_DEPTH
-from v3d_torch.runtime.batches import common_batch, mask_or_all
+from v3d_torch.runtime.batches import check_shapes, mask_or_all
 
 _MIN_PNP_POINTS = 6
 """Minimum number of points: a sample of 3, a point that selects one of its four poses, and points that confirm it."""
@@ -83,14 +82,9 @@ def pnp_ransac(
     """
     check_masks(valid=valid)
     check_positive(threshold=threshold, iterations=iterations)
-    KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
-    KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
-    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    if valid is not None:
-        KORNIA_CHECK_SHAPE(valid, ["*", str(points.shape[-2])])
-    if initial_guess is not None:
-        KORNIA_CHECK_SHAPE(initial_guess, ["*", "4", "4"])
-    batch = common_batch(points=(points, 2), uv=(uv, 2), K=(K, 2), initial_guess=(initial_guess, 2), valid=(valid, 1))
+    batch = check_shapes(
+        points=(points, "N", 3), uv=(uv, "N", 2), K=(K, 3, 3), initial_guess=(initial_guess, 4, 4), valid=(valid, "N")
+    )
     present = mask_or_all(valid, uv[..., 0]) & points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)
     mask = present.expand(*batch, -1)
     count = mask.sum(dim=-1)

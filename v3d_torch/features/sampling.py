@@ -49,9 +49,10 @@ def find_best_hypothesis(
         The best hypothesis, shape :math:`(..., r, c)`, and a mask of the problems with one, bool, shape :math:`(...)`.
     """
     has_sample = valid.sum(dim=-1) >= size
+    best = default.expand(*valid.shape[:-1], *default.shape)
     if valid.shape[-1] < size:
-        return default.expand(*valid.shape[:-1], *default.shape), has_sample
-    best, lowest = None, None
+        return best, has_sample
+    lowest = torch.full(valid.shape[:-1], torch.inf, dtype=default.dtype, device=default.device)
     for samples in draw_samples(valid, size, iterations, seed).split(_CHUNK, dim=-2):
         hypotheses = solve(samples).flatten(-4, -3)
         errors = squared_errors(hypotheses).nan_to_num(nan=torch.inf).clamp(max=threshold**2)
@@ -59,13 +60,8 @@ def find_best_hypothesis(
         costs = torch.where(hypotheses.isfinite().all(dim=(-2, -1)), costs, torch.inf)
         cost, index = costs.min(dim=-1)
         chosen = torch.take_along_dim(hypotheses, index[..., None, None, None], dim=-3)[..., 0, :, :]
-        if best is None or lowest is None:
-            best, lowest = chosen, cost
-        else:
-            is_better = cost < lowest
-            best, lowest = torch.where(is_better[..., None, None], chosen, best), torch.where(is_better, cost, lowest)
-    if best is None or lowest is None:
-        raise ValueError("RANSAC needs at least one iteration")
+        is_better = cost < lowest
+        best, lowest = torch.where(is_better[..., None, None], chosen, best), torch.where(is_better, cost, lowest)
     found = lowest.isfinite() & has_sample
     return torch.where(found[..., None, None], best, default), found
 

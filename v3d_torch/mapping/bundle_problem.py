@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
@@ -27,7 +26,7 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import check_finite_arguments, check_weights, common_batch, fill_indices, fill_padding
+from v3d_torch.runtime.batches import check_finite_arguments, check_shapes, fill_indices, fill_weights
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -224,29 +223,19 @@ def prepare_bundle(
         ConfigError: If a standard deviation that is a number is not positive.
     """
     check_masks(fixed=fixed, valid=valid)
-    KORNIA_CHECK_SHAPE(T_cw, ["*", "P", "4", "4"])
-    KORNIA_CHECK_SHAPE(points, ["*", "L", "3"])
-    KORNIA_CHECK_SHAPE(uv, ["*", str(pose.shape[-1]), "2"])
-    KORNIA_CHECK_SHAPE(point, ["*", str(pose.shape[-1])])
-    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    for column in (inverse_depth, weights, valid):
-        if column is not None:
-            KORNIA_CHECK_SHAPE(column, ["*", str(pose.shape[-1])])
-    if fixed is not None:
-        KORNIA_CHECK_SHAPE(fixed, ["*", str(T_cw.shape[-3])])
-    batch = common_batch(
-        T_cw=(T_cw, 3),
-        points=(points, 2),
-        uv=(uv, 2),
-        pose=(pose, 1),
-        point=(point, 1),
-        K=(K, 2),
-        inverse_depth=(inverse_depth, 1),
-        pixel_sigma=(pixel_sigma, 1),
-        inverse_depth_sigma=(inverse_depth_sigma, 1),
-        fixed=(fixed, 1),
-        weights=(weights, 1),
-        valid=(valid, 1),
+    batch = check_shapes(
+        T_cw=(T_cw, "P", 4, 4),
+        points=(points, "L", 3),
+        pose=(pose, "M"),
+        uv=(uv, "M", 2),
+        point=(point, "M"),
+        K=(K, 3, 3),
+        inverse_depth=(inverse_depth, "M"),
+        pixel_sigma=(pixel_sigma, None),
+        inverse_depth_sigma=(inverse_depth_sigma, None),
+        fixed=(fixed, "P"),
+        weights=(weights, "M"),
+        valid=(valid, "M"),
     )
     check_finite_arguments(T_cw=T_cw, points=points)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
@@ -257,16 +246,12 @@ def prepare_bundle(
         fixed = torch.arange(T_cw.shape[-3], device=T_cw.device) == 0
     pose = fill_indices("pose", pose, T_cw.shape[-3], valid)
     point = fill_indices("point", point, points.shape[-2], valid)
-    if weights is None:
-        weights = torch.ones(pose.shape, dtype=torch.float64, device=uv.device)
-    else:
-        check_weights(weights, valid)
     each = (*batch, pose.shape[-1])  # observation
     problem = BundleProblem(
         scale=target.scale.expand(*batch, 3, -1),
         offset=target.offset.expand(*batch, 3, -1),
         thresholds=measured.chi2_threshold.expand(each),
-        weights=fill_padding(weights, valid, 0.0).expand(each),
+        weights=fill_weights(weights, valid).expand(each),
         pose=pose.expand(each),
         point=point.expand(each),
         fixed=fixed.expand(*batch, T_cw.shape[-3]),

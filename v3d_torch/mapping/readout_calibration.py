@@ -9,7 +9,6 @@ estimate of the readout, and its curvature is the information of that estimate.
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import InputError
@@ -21,7 +20,7 @@ from v3d_torch.mapping.bundle_adjustment import sort_by_point
 from v3d_torch.mapping.bundle_problem import NEGLIGIBLE_DAMPING, BundleProblem, prepare_bundle
 from v3d_torch.optim.reprojection import INVERSE_DEPTH_SIGMA, MIN_DEPTH
 from v3d_torch.optim.schur import SCHUR_REGULARISATION
-from v3d_torch.runtime.batches import common_batch, fill_padding, from_rows, to_rows
+from v3d_torch.runtime.batches import check_shapes, fill_padding, from_rows, to_rows
 
 _PRIOR_WEIGHT = 0.85
 """Weight of the earlier information: the first bundle adjustments have the least accurate camera motion."""
@@ -100,14 +99,13 @@ def estimate_readout(
     old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
     if can_read(old_information) and not bool((old_information >= 0).all()):
         raise InputError("information has a value that is negative or NaN; give inverse variances of at least 0")
-    KORNIA_CHECK_SHAPE(readout_jacobian, ["*", str(pose.shape[-1]), "2"])
-    batch = common_batch(
-        seconds=(seconds, 0),
-        information=(information, 0),
-        readout_jacobian=(readout_jacobian, 2),
-        T_cw=(T_cw, 3),
-        points=(points, 2),
-        uv=(uv, 2),
+    batch = check_shapes(
+        seconds=(seconds,),
+        information=(information,),
+        readout_jacobian=(readout_jacobian, "M", 2),
+        T_cw=(T_cw, "P", 4, 4),
+        points=(points, "L", 3),
+        uv=(uv, "M", 2),
     )
     T_cw = T_cw.expand(*batch, *T_cw.shape[-3:])
     problem, state, valid = prepare_bundle(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import isnan
 from typing import Any
@@ -19,7 +19,7 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedOb
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
 from v3d_torch.objects.mask_propagation import propagate_instances
-from v3d_torch.objects.mask_refiner import MaskRefiner, RefinedMask
+from v3d_torch.objects.mask_refiner import MaskRefiner
 from v3d_torch.objects.motion_evidence import (
     DetectionPairs,
     chamfer_evidence,
@@ -28,7 +28,7 @@ from v3d_torch.objects.motion_evidence import (
     hough_vote_evidence,
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.objects.static_mask import static_masks
+from v3d_torch.objects.static_mask import StaticMasks, static_masks
 from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.track import Track
 from v3d_torch.objects.visible_masks import visible_masks
@@ -127,15 +127,7 @@ class MotionClassifier(StatefulComponent):
             track.mark_supported(stamp, is_supported)
         motion_states = {track: self._motion_state(track, free_space.appeared[track], stamp) for track in tracks}
 
-        # Static mask. Most excluded objects are people, and each mask is refined once.
-        excluded = [track for track, motion_state in motion_states.items() if not self._is_trackable(motion_state)]
-        people = [track for track in tracks if track.label == PERSON]
-        refined = self._refined_masks(list(dict.fromkeys([*excluded, *people])), view, newly_occupied)
-        masks = static_masks(
-            [refined[track] for track in excluded], list(refined.values()), view.missing.shape, config.static_mask
-        )
-
-        visible = visible_masks(tracks, refined, view.missing)
+        masks, visible = self._masks(motion_states, view, newly_occupied)
         objects = [
             TrackedObject(
                 id=track.id,
@@ -180,11 +172,19 @@ class MotionClassifier(StatefulComponent):
         """
         return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds)
 
-    def _refined_masks(
-        self, tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied
-    ) -> dict[Track, RefinedMask]:
+    def _masks(
+        self, motion_states: Mapping[Track, MotionState], view: DepthView, newly_occupied: NewlyOccupied
+    ) -> tuple[StaticMasks, list[Tensor]]:
+        """Return the static masks of the frame, and the visible pixels of each object, bool, (H, W) each."""
+        # Most excluded objects are people, and each mask is refined once.
+        excluded = [track for track, motion_state in motion_states.items() if not self._is_trackable(motion_state)]
+        people = [track for track in motion_states if track.label == PERSON]
+        tracks = list(dict.fromkeys([*excluded, *people]))
         refiner = MaskRefiner(tracks, view, newly_occupied, self.static_surfaces, self._config, self._camera)
-        return {track: refiner.refine(track) for track in tracks}
+        refined = {track: refiner.refine(track) for track in tracks}
+        size, config = view.missing.shape, self._config.static_mask
+        masks = static_masks([refined[track] for track in excluded], list(refined.values()), size, config)
+        return masks, visible_masks(list(motion_states), refined, view.missing)
 
     def _deformation_candidates(self, pairs: DetectionPairs, stamp: float) -> DetectionPairs:
         """Return the pairs of living objects that are not dynamic: Chamfer distances refine the vote (Sec. I)."""

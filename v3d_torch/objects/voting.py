@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import VotingConfig
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.argument_checks import check_masks, check_not_negative
 from v3d_torch.geometry.precision import result_dtype, working_dtype
-from v3d_torch.runtime.batches import common_batch
+from v3d_torch.runtime.batches import check_shapes
 
 _STATIC_VOTER_RATIO = 0.5
 """Maximum motion of the centroid of a voting object if the free-space check is enabled, as a fraction of the distance
@@ -75,10 +74,7 @@ def hough_vote(
     check_not_negative(distance_threshold=distance_threshold, vote_threshold=vote_threshold)
     if isinstance(temperature, (int, float)) and not temperature > 0:  # also if it is NaN
         raise ConfigError(f"hough_vote: temperature is {temperature}; give a number above 0, or None")
-    KORNIA_CHECK_SHAPE(previous, ["*", "K", "3"])
-    KORNIA_CHECK_SHAPE(current, ["*", str(previous.shape[-2]), "3"])
-    KORNIA_CHECK_SHAPE(present, ["*", str(previous.shape[-2])])
-    common_batch(previous=(previous, 2), current=(current, 2), present=(present, 1))
+    check_shapes(previous=(previous, "K", 3), current=(current, "K", 3), present=(present, "K"))
     diagonal = torch.eye(present.shape[-1], dtype=torch.bool, device=present.device)
     comparable = present[..., :, None] & present[..., None, :] & ~diagonal
 

@@ -18,6 +18,7 @@ from v3d_torch.occupancy.occupancy_map import OccupancyMap
 from v3d_torch.occupancy.range_view import RangeView
 from v3d_torch.occupancy.up_direction import UpDirection, estimate_up
 from v3d_torch.occupancy.view_store import ViewStore, displacement
+from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.tracking.pose_history import PoseHistory
 
 _LOG = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ _REBUILD_VIEWS = 4
 """Number of stored views that are added with each new view during a rebuild, which is spread over many frames."""
 
 
-class OccupancyMapper:
+class OccupancyMapper(StatefulComponent):
     """Adds frames to an occupancy map.
 
     All added range views are stored. When bundle adjustment or a loop has moved one of them by more than half a voxel,
@@ -55,6 +56,8 @@ class OccupancyMapper:
         up: Approximate up direction, which `find_floor` refines.
         floor: Floor of the map when it was last found; None before.
     """
+
+    _STATE = ("map", "_store", "_count", "floor", "up", "_rebuilt", "_rebuilt_views")
 
     def __init__(self, config: OccupancyConfig, camera: PinholeCamera) -> None:
         self._config = config
@@ -125,28 +128,10 @@ class OccupancyMapper:
         self._continue_rebuild(len(self._store))
         self.floor = self.find_floor() or self.floor
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the map, the stored views, and the state of a rebuild."""
-        return {
-            "map": self.map.state_dict(),
-            "store": self._store.state_dict(),
-            "count": self._count,
-            "floor": self.floor,
-            "up": self.up,
-            "rebuilt": None if self._rebuilt is None else self._rebuilt.state_dict(),
-            "rebuilt_views": self._rebuilt_views,
-        }
-
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self.map.load_state_dict(state["map"])
-        self._store.load_state_dict(state["store"])
-        self._count, self._rebuilt_views = state["count"], state["rebuilt_views"]
-        self.up, self.floor = state["up"], state["floor"]
-        self._rebuilt = None
-        if state["rebuilt"] is not None:
-            self._rebuilt = OccupancyMap(self._config)
-            self._rebuilt.load_state_dict(state["rebuilt"])
+        """Restore a state of `state_dict`: the map, the stored views, and the state of a rebuild."""
+        self._rebuilt = None if state["rebuilt"] is None else OccupancyMap(self._config)
+        super().load_state_dict(state)
 
     def _is_search_due(self) -> bool:
         """Check whether the floor is searched after this view."""

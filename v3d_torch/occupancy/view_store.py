@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.occupancy.range_view import RangeView
+from v3d_torch.runtime.stateful import StatefulComponent
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,7 +24,7 @@ _KEPT_FRACTION = 0.9
 """Fraction of the capacity that is kept when views are removed, so that removal is rare."""
 
 
-class ViewStore:
+class ViewStore(StatefulComponent):
     """Range views in the order of time.
 
     If there are too many views, the space of poses is divided into cells, and only the newest view of each cell is
@@ -45,6 +44,8 @@ class ViewStore:
         has_removed_far: True if views were removed because they were far from the camera, so that the other views do
             not show all places.
     """
+
+    _STATE = ("views", "frames", "T_dc", "T_dw", "has_removed_far")
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
@@ -69,8 +70,8 @@ class ViewStore:
         """
         self.T_dc = torch.cat([self.T_dc, T_dc[None]])
         self.T_dw = torch.cat([self.T_dw, (T_dc @ T_cw)[None]])
-        self.views.append(view)
-        self.frames.append(frame)
+        # New lists, because the old ones can be part of a stored state.
+        self.views, self.frames = [*self.views, view], [*self.frames, frame]
 
     def reduce(self) -> Tensor | None:
         """Remove views if there are too many.
@@ -96,17 +97,6 @@ class ViewStore:
         self.views = [view for view, keep in zip(self.views, kept.tolist(), strict=True) if keep]
         self.frames = [frame for frame, keep in zip(self.frames, kept.tolist(), strict=True) if keep]
         return kept
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the views."""
-        own = {"views": self.views, "frames": self.frames, "T_dc": self.T_dc, "T_dw": self.T_dw}
-        return {**own, "has_removed_far": self.has_removed_far}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the views of `state_dict`."""
-        self.views, self.frames = list(state["views"]), list(state["frames"])
-        self.T_dc, self.T_dw = state["T_dc"], state["T_dw"]
-        self.has_removed_far = state["has_removed_far"]
 
     def _newest_per_cell(self, side: float) -> Tensor:
         """Mask of the newest view in each cell of poses, bool, (N,)."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import DenseOdometryConfig
@@ -23,7 +22,7 @@ from v3d_torch.geometry.se3 import adjoint, invert, orthonormalise
 from v3d_torch.odometry.dense_problem import AlignmentProblem, State, System, step
 from v3d_torch.odometry.dense_view import DenseView, LevelCamera
 from v3d_torch.optim.levenberg_marquardt import POSE_TOLERANCE, OptimisationResult, levenberg_marquardt
-from v3d_torch.runtime.batches import common_batch
+from v3d_torch.runtime.batches import check_shapes
 
 _COARSE_INVERSE_DEPTH_SIGMA = 0.02
 """Minimum standard deviation of inverse depth on all levels but the finest, 1/m. It reduces the weight of depth there:
@@ -163,30 +162,25 @@ class DenseAligner(torch.nn.Module):
     ) -> DenseAlignment:
         """Align images :math:`(*, 1, H, W)`; see :func:`align_depth`."""
         check_masks(static_a=static_a, static_b=static_b)
-        images = grey_a, depth_a, grey_b, depth_b
-        for image in images:
-            KORNIA_CHECK_SHAPE(image, ["*", "1", str(grey_a.shape[-2]), str(grey_a.shape[-1])])
+        batch = check_shapes(
+            grey_a=(grey_a, 1, "H", "W"),
+            depth_a=(depth_a, 1, "H", "W"),
+            grey_b=(grey_b, 1, "H", "W"),
+            depth_b=(depth_b, 1, "H", "W"),
+            T_ba=(T_ba, 4, 4),
+            static_a=(static_a, "H", "W"),
+            static_b=(static_b, "H", "W"),
+        )
         size = grey_a.shape[-2:]
-        pixels = grey_a.new_ones(size, dtype=torch.bool)
-        masks = tuple(pixels if static is None else static for static in (static_a, static_b))
-        for mask in masks:
-            KORNIA_CHECK_SHAPE(mask, ["*", *map(str, size)])
-        motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
-        KORNIA_CHECK_SHAPE(motion, ["*", "4", "4"])
         if size != self._size:
             raise InputError(
                 f"the images have {size[1]} x {size[0]} pixels, the camera {self._size[1]} x {self._size[0]}; give a"
                 " camera of the size of the images"
             )
-        batch = common_batch(
-            grey_a=(grey_a, 3),
-            depth_a=(depth_a, 3),
-            grey_b=(grey_b, 3),
-            depth_b=(depth_b, 3),
-            T_ba=(T_ba, 2),
-            static_a=(static_a, 2),
-            static_b=(static_b, 2),
-        )
+        images = grey_a, depth_a, grey_b, depth_b
+        motion = torch.eye(4, dtype=torch.float64, device=grey_a.device) if T_ba is None else T_ba.to(torch.float64)
+        pixels = grey_a.new_ones(size, dtype=torch.bool)
+        masks = (pixels if static is None else static for static in (static_a, static_b))
         columns = (
             *(image.to(torch.float32).expand(*batch, 1, *size).reshape(-1, 1, *size) for image in images),
             motion.expand(*batch, 4, 4).reshape(-1, 4, 4),

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import RollingShutterConfig
@@ -25,7 +24,7 @@ from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.runtime.batches import common_batch, fill_padding
+from v3d_torch.runtime.batches import check_shapes, fill_padding
 
 _MIN_HEIGHT = 2
 """Minimum number of rows: the readout is the time from the first to the last row."""
@@ -180,25 +179,17 @@ def compensate_rolling_shutter(
         ConfigError: If ``height`` is less than 2.
     """
     check_masks(valid=valid)
-    KORNIA_CHECK_SHAPE(uv, ["*", "N", "2"])
-    KORNIA_CHECK_SHAPE(velocity, ["*", "6"])
-    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    for column in (row, inverse_depth, valid):
-        if column is not None:
-            KORNIA_CHECK_SHAPE(column, ["*", str(uv.shape[-2])])
-    if readout_jacobian is not None:
-        KORNIA_CHECK_SHAPE(readout_jacobian, ["*", str(uv.shape[-2]), "2"])
     if height < _MIN_HEIGHT:
         raise ConfigError(f"height is {height}; give at least {_MIN_HEIGHT} rows")
-    common_batch(
-        uv=(uv, 2),
-        row=(row, 1),
-        inverse_depth=(inverse_depth, 1),
-        velocity=(velocity, 1),
-        readout=(readout, 0),
-        K=(K, 2),
-        readout_jacobian=(readout_jacobian, 2),
-        valid=(valid, 1),
+    check_shapes(
+        uv=(uv, "N", 2),
+        row=(row, "N"),
+        inverse_depth=(inverse_depth, "N"),
+        velocity=(velocity, 6),
+        readout=(readout,),
+        K=(K, 3, 3),
+        readout_jacobian=(readout_jacobian, "N", 2),
+        valid=(valid, "N"),
     )
     seconds = torch.as_tensor(readout, dtype=torch.float64, device=uv.device)[..., None, None]
     each = None if valid is None else valid[..., None]

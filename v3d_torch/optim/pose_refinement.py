@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
@@ -41,7 +40,7 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
-from v3d_torch.runtime.batches import check_weights, common_batch, fill_padding, to_rows
+from v3d_torch.runtime.batches import check_shapes, fill_padding, fill_weights, to_rows
 
 ITERATIONS = 5
 """Default maximum number of Levenberg-Marquardt steps in a round."""
@@ -216,37 +215,28 @@ def refine_pose(
     """
     check_masks(valid=valid)
     check_positive(rounds=rounds)
-    KORNIA_CHECK_SHAPE(T_cw, ["*", "4", "4"])
-    KORNIA_CHECK_SHAPE(points, ["*", "N", "3"])
-    KORNIA_CHECK_SHAPE(uv, ["*", str(points.shape[-2]), "2"])
-    KORNIA_CHECK_SHAPE(K, ["*", "3", "3"])
-    for each in (inverse_depth, weights, valid):
-        if each is not None:
-            KORNIA_CHECK_SHAPE(each, ["*", str(points.shape[-2])])
-    batch = common_batch(
-        T_cw=(T_cw, 2),
-        points=(points, 2),
-        uv=(uv, 2),
-        K=(K, 2),
-        inverse_depth=(inverse_depth, 1),
-        pixel_sigma=(pixel_sigma, 1),
-        inverse_depth_sigma=(inverse_depth_sigma, 1),
-        weights=(weights, 1),
-        valid=(valid, 1),
+    batch = check_shapes(
+        T_cw=(T_cw, 4, 4),
+        points=(points, "N", 3),
+        uv=(uv, "N", 2),
+        K=(K, 3, 3),
+        inverse_depth=(inverse_depth, "N"),
+        pixel_sigma=(pixel_sigma, None),
+        inverse_depth_sigma=(inverse_depth_sigma, None),
+        weights=(weights, "N"),
+        valid=(valid, "N"),
     )
     finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
-    if weights is not None:
-        check_weights(weights, valid)
+    weights = fill_weights(weights, valid)
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     scale, offset = whiten(measured, K.to(torch.float64))
-    thresholds = measured.chi2_threshold
     problem = _Problem(
         points=fill_padding(points, valid[..., None], 0.0),
         scale=scale,
         offset=offset,
-        thresholds=thresholds,
-        weights=fill_padding(torch.ones_like(thresholds) if weights is None else weights, valid, 0.0),
+        thresholds=measured.chi2_threshold,
+        weights=weights,
         valid=valid,
     )
     initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)

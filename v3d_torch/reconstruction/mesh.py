@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from v3d_torch.config import DenseMapConfig
+from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.reconstruction.tsdf import BLOCK, integrate, surface_blocks
@@ -111,7 +112,7 @@ def _drop_hidden(vertices: Tensor, faces: Tensor, views: StaticViews, config: De
     hidden = torch.ones(len(faces), dtype=torch.bool)
     for view in views:
         rows = torch.nonzero(hidden)[:, 0]
-        hidden[rows] = _observe(centres[rows], normals[rows], view, views, config)[0] == 0
+        hidden[rows] = _observe(centres[rows], normals[rows], view, views.camera, config)[0] == 0
     return faces[~hidden]
 
 
@@ -136,21 +137,21 @@ def _vertex_colours(vertices: Tensor, normals: Tensor, views: StaticViews, confi
     """
     sums, weights = vertices.new_zeros(len(vertices), 3), vertices.new_zeros(len(vertices), 1)
     for view in views:
-        weight, u, v = _observe(vertices, normals, view, views, config)
+        weight, u, v = _observe(vertices, normals, view, views.camera, config)
         sums += weight[:, None] * view.colour[:, v, u].T
         weights += weight[:, None]
     return torch.where(weights > 0, sums / weights, 0.0).round().to(torch.uint8)
 
 
 def _observe(
-    points: Tensor, normals: Tensor, view: StaticView, views: StaticViews, config: DenseMapConfig
+    points: Tensor, normals: Tensor, view: StaticView, camera: PinholeCamera, config: DenseMapConfig
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Weights of points of the surface in a view, and their pixels (u, v), shape (N,) each.
 
     The weight is the inverse squared depth, and 0 where the view observes another surface, or this one from behind.
     """
     in_camera = transform_points(view.T_dw, points)
-    pixels, inside = views.camera.project_to_image(in_camera, config.mesh.voxel_size)
+    pixels, inside = camera.project_to_image(in_camera, config.mesh.voxel_size)
     u, v = pixels.round().to(torch.int64).unbind(dim=1)
     u, v = torch.where(inside, u, 0), torch.where(inside, v, 0)
     z = in_camera[:, 2]

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.frustum import are_in_frustum
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.objects.depth_view import SpaceView
 
@@ -46,15 +48,12 @@ class PointBlocks:
         Returns:
             Indices of points, each at most once, int64, shape :math:`(K,)`.
         """
-        x, y, z = (view.T_dw[:3, :3] @ self._centres.T + view.T_dw[:3, 3:]).unbind(dim=0)
-        near, far = z - self._radii, z + self._radii
+        centres = transform_points(view.T_dw, self._centres)
+        near, far = centres[:, 2] - self._radii, centres[:, 2] + self._radii
         # The depth minus its tolerance is a concave function of the depth, so it is least at one end.
         least = torch.minimum(_nearest_measurable(near, config), _nearest_measurable(far, config))
         seen = (far > config.min_depth) & (least < float(view.nearest_depth.max()))
-        x_min, x_max, y_min, y_max, _, _ = camera.bounds
-        for across, lowest, highest in ((x, x_min, x_max), (y, y_min, y_max)):
-            for normal, distance in ((lowest, across - lowest * z), (highest, highest * z - across)):
-                seen &= distance >= -self._radii * (1 + normal**2) ** 0.5
+        seen &= are_in_frustum(centres, self._radii, camera)
         counts = self._counts[seen]
         begins = self._ends[seen] - counts  # in the order of blocks
         within = torch.arange(int(counts.sum())) - (counts.cumsum(0) - counts).repeat_interleave(counts)

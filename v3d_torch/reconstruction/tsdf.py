@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import DenseMapConfig
-from v3d_torch.geometry.camera import back_project
+from v3d_torch.geometry.camera import PinholeCamera, back_project
 from v3d_torch.geometry.cell_keys import cell_keys, cells_of_keys
+from v3d_torch.geometry.frustum import are_in_frustum
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 
@@ -71,10 +72,13 @@ def integrate(blocks: Tensor, views: StaticViews, config: DenseMapConfig) -> tup
     steps = torch.arange(BLOCK, dtype=torch.float64) * config.mesh.voxel_size
     offsets = torch.cartesian_prod(steps, steps, steps)  # of the voxels in a block, (512, 3)
     corners = blocks.to(torch.float64) * (BLOCK * config.mesh.voxel_size)
+    to_centre = offsets[-1] / 2
+    radius = float(to_centre.norm())
     sums, weights = torch.zeros(2, len(blocks), len(offsets))
     for view in views:
-        for rows in _blocks_in_view(corners, view, views, config).split(_BLOCKS_PER_STEP):
-            distance, weight = _measure(corners[rows], offsets, view, views, config)
+        in_view = are_in_frustum(transform_points(view.T_dw, corners + to_centre), radius, views.camera)
+        for rows in torch.nonzero(in_view)[:, 0].split(_BLOCKS_PER_STEP):
+            distance, weight = _measure(corners[rows], offsets, view, views.camera, config)
             sums[rows] += weight * distance
             weights[rows] += weight
     distances = torch.where(weights > 0, sums / weights, 1.0)
@@ -82,30 +86,13 @@ def integrate(blocks: Tensor, views: StaticViews, config: DenseMapConfig) -> tup
     return distances.reshape(shape), weights.reshape(shape)
 
 
-def _blocks_in_view(corners: Tensor, view: StaticView, views: StaticViews, config: DenseMapConfig) -> Tensor:
-    """Rows of the blocks, given by their first corners, whose bounding spheres intersect the viewing frustum."""
-    side = (BLOCK - 1) * config.mesh.voxel_size
-    radius = 0.5 * 3**0.5 * side
-    x, y, z = transform_points(view.T_dw, corners + 0.5 * side).unbind(dim=1)
-    camera = views.camera
-    inside = z > -radius
-    for position, focal, first, last in (
-        (x, camera.fx, -0.5 - camera.cx, camera.width - 0.5 - camera.cx),
-        (y, camera.fy, -0.5 - camera.cy, camera.height - 0.5 - camera.cy),
-    ):  # signed distances to the four side planes of the frustum
-        inside &= focal * position - first * z >= -radius * (focal**2 + first**2) ** 0.5
-        inside &= last * z - focal * position >= -radius * (focal**2 + last**2) ** 0.5
-    return torch.nonzero(inside)[:, 0]
-
-
 def _measure(
-    corners: Tensor, offsets: Tensor, view: StaticView, views: StaticViews, config: DenseMapConfig
+    corners: Tensor, offsets: Tensor, view: StaticView, camera: PinholeCamera, config: DenseMapConfig
 ) -> tuple[Tensor, Tensor]:
     """Truncated distances and weights of the voxels of blocks in one view, float32, shape (n, 512) each."""
     base = transform_points(view.T_dw, corners).to(torch.float32)
     step = (offsets @ view.T_dw[:3, :3].T).to(torch.float32)
     x, y, z = (base[:, None, axis] + step[:, axis] for axis in range(3))
-    camera = views.camera
     inverse_z = 1 / z.clamp(min=config.mesh.voxel_size)
     u = (camera.fx * x * inverse_z + camera.cx).round()
     v = (camera.fy * y * inverse_z + camera.cy).round()

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -87,6 +88,39 @@ def check_weights(weights: Tensor, valid: Tensor) -> None:
         raise InputError("weights has a value that is negative or NaN; give weights of at least 0")
     if bool((weights.isinf() & valid).any()):
         raise InputError("weights has an infinite value; give finite weights")
+
+
+def fill_weights(weights: Tensor | None, valid: Tensor) -> Tensor:
+    """Return weights in float64 after `check_weights`, with 0 for padding.
+
+    Args:
+        weights: Weights of the measurements; None for 1.
+        valid: Mask of the measurements that are not padding, bool, a shape that broadcasts.
+    """
+    if weights is None:
+        return valid.to(torch.float64)
+    check_weights(weights, valid)
+    return fill_padding(weights, valid, 0.0)
+
+
+def check_shapes(**arguments: tuple[Tensor | float | None, *tuple[int | str | None, ...]]) -> torch.Size:
+    """Check the shapes of the arguments of a function, and return the broadcast shape of their batches.
+
+    Args:
+        arguments: Arguments by name, each with its dimensions without the batch: a number; a letter for a size that is
+            the same in all arguments; None for a size that is checked elsewhere. Only tensors are checked.
+
+    Raises:
+        ShapeError: If an argument has another shape.
+        InputError: If the batches do not broadcast.
+    """
+    sizes: dict[str, int] = {}
+    for value, *dimensions in arguments.values():
+        if isinstance(value, Tensor) and None not in dimensions:
+            KORNIA_CHECK_SHAPE(value, ["*", *(str(sizes.get(str(size), size)) for size in dimensions)])
+            found = zip(dimensions, value.shape[value.ndim - len(dimensions) :], strict=True)
+            sizes |= {letter: size for letter, size in found if isinstance(letter, str)}
+    return common_batch(**{name: (value, len(dimensions)) for name, (value, *dimensions) in arguments.items()})
 
 
 def common_batch(**arguments: tuple[Tensor | float | None, int]) -> torch.Size:
