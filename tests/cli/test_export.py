@@ -245,6 +245,18 @@ def test_map_without_common_landmarks_gives_a_note(results: Path, tmp_path: Path
     assert done.exit_code == 0 and "note: no image points are written: " in done.stdout and "gone.npz" in done.stdout
 
 
+def test_map_that_a_later_run_replaced_is_named(results: Path, sequence: Path, tmp_path: Path) -> None:
+    copy, later = tmp_path / "copy", tmp_path / "room.npz"
+    shutil.copytree(results, copy)
+    request = (results / "request.yaml").read_text()
+    (copy / "request.yaml").write_text(request.replace(str(results.with_name("room.npz")), str(later)))
+    options = ("--segmenter", "none", "--set", "mapping.max_keyframe_interval=3", "--out", tmp_path / "later")
+    assert invoke(run.app, "--seq", sequence, *options, "--save-map", later).exit_code == 0
+    done = call(copy, "--format", "colmap", "--out", tmp_path / "out", "--keyframes")
+    note = f"note: no image points are written: {later} is the map of another run; run the sequence again with"
+    assert done.exit_code == 0 and note in done.stdout, done.stdout
+
+
 @pytest.mark.parametrize(
     ("file", "words"),
     [

@@ -387,6 +387,16 @@ def test_unsuitable_result_folder_leaves_no_recording(file: str, words: str, seq
     assert not (tmp_path / "run.rrd").exists()
 
 
+@pytest.mark.parametrize(("table", "words"), [("runs.parquet", "a batch"), ("ablation.csv", "an ablation study")])
+def test_run_does_not_replace_a_run_of_a_batch(table: str, words: str, sequence: Path, tmp_path: Path) -> None:
+    """The tables of the batch would keep the values of the run that is gone, and --resume could accept the new one."""
+    (tmp_path / table).write_text("")
+    out = tmp_path / "walk" / "full" / "seed0"
+    done = call_here("--seq", sequence, "--segmenter", "none", "--out", out, cwd=tmp_path)
+    assert_error_line(done, f"{out}: is the folder of a run of {words}; choose another folder with --out")
+    assert not out.exists()
+
+
 @pytest.mark.parametrize("below", [False, True])
 def test_result_folder_at_or_below_a_file_is_rejected(below: bool, sequence: Path, tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")

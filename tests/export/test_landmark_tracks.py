@@ -6,7 +6,7 @@ import torch
 from helpers.sparse_maps import EYE, features, make_map
 from torch import Tensor
 
-from v3d_torch.export.landmark_tracks import landmark_tracks
+from v3d_torch.export.landmark_tracks import has_keyframes, landmark_tracks
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.types import Trajectory
@@ -66,3 +66,13 @@ def test_empty_map_or_no_images_have_no_landmarks() -> None:
     empty = Trajectory(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
     tracks = landmark_tracks(make_tables(), empty)
     assert (len(tracks.points), len(tracks.image), tracks.uv.shape) == (0, 0, (0, 2))
+
+
+def test_map_of_another_run_has_not_all_keyframes() -> None:
+    tables = make_tables()
+    assert has_keyframes(tables, images(0.0, 1.0, 2.0))
+    assert has_keyframes(tables, images(0.0, 2.0))  # the map of a run with --load-map has more
+    moved = T_CW.clone()
+    moved[1:, 0, 3] += 0.001
+    assert not has_keyframes(tables, images(0.0, 1.0, 2.0, T_cw=moved))
+    assert not has_keyframes(make_map(), images(0.0))

@@ -15,7 +15,7 @@ from v3d_torch.datasets import RGBDStream
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.export.colmap import write_colmap
-from v3d_torch.export.landmark_tracks import LandmarkTracks, landmark_tracks
+from v3d_torch.export.landmark_tracks import LandmarkTracks, has_keyframes, landmark_tracks
 from v3d_torch.export.nerfstudio import write_nerfstudio
 from v3d_torch.export.posed_image import PosedImage, Undistorter
 from v3d_torch.export.static_recording import StaticRecording
@@ -181,6 +181,8 @@ def _read_tracks(export: _Export) -> tuple[LandmarkTracks, list[str]]:
         reason = f"{path} has no landmarks that two of the images observe"
         try:
             tables = load_map(path, export.source.camera, export.run.config or Config()).map
+            if export.run.keyframes is not None and not has_keyframes(tables, export.run.keyframes):
+                reason = f"{path} is the map of another run; run the sequence again with --save-map and another file"
         except InputError as error:
             reason = str(error)
     tracks = landmark_tracks(tables, export.frames.poses)

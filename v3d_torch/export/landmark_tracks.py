@@ -73,6 +73,19 @@ def landmark_tracks(tables: MapTables, images: Trajectory) -> LandmarkTracks:
     )
 
 
+def has_keyframes(tables: MapTables, keyframes: Trajectory) -> bool:
+    """Check whether a map has all keyframes of a run at their times and poses, so that it is the map of this run.
+
+    One equal keyframe is not enough: the first keyframe of most runs of a sequence is the origin of the world.
+
+    Args:
+        tables: Data of the map.
+        keyframes: Poses of the keyframes at the end of the run.
+    """
+    found = _images_of_keyframes(tables, keyframes)
+    return len(found[found >= 0].unique()) == len(keyframes)
+
+
 def _images_of_keyframes(tables: MapTables, images: Trajectory) -> Tensor:
     """Index of the image of each keyframe, -1 for none, int64, shape (K,)."""
     keyframe_stamps = torch.tensor([each.stamp for each in tables.keyframes], dtype=torch.float64)
