@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -224,16 +222,6 @@ def test_part_of_the_mask_that_belonged_to_the_object_at_its_last_detection_is_k
 def test_narrow_background_along_the_contour_of_a_mask_is_not_kept() -> None:
     refined = refine(depth_of(), beside=10, surface_margin=0, depth_margin=0)
     assert not refined[ROWS.start : CUT, COLUMNS.stop + STEP :].any()
-
-
-@pytest.mark.parametrize("step", [2, 4, 8])
-def test_width_of_a_part_that_is_kept_grows_with_the_image(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The step between the pixels grows with the image, as the errors of the network's contours do."""
-    monkeypatch.setattr(sys.modules[__name__], "STEP", step)
-    for width, is_kept in ((3 * step, False), (7 * step, True)):
-        beside = slice(ROWS.start, CUT), slice(COLUMNS.stop + step, COLUMNS.stop + width)
-        refined = refine(depth_of(), beside=width, surface_margin=0, depth_margin=0)
-        assert bool(refined[beside].any()) is is_kept
 
 
 @pytest.mark.parametrize("seed", range(6))

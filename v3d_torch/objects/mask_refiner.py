@@ -39,9 +39,8 @@ _TOLERANCE_GROWTH = 0.01
 """Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
 depth of a structured-light camera."""
 
-_MIN_PART_RADIUS = 2
-"""Minimum radius of a part of the network's mask that is kept beside the object's surface, cells: every n-th pixel,
-with a step that grows with the image, as the errors of the contours do."""
+_MIN_PART_RADIUS = 8
+"""Minimum radius of a part of the network's mask that is kept beside the object's surface, pixels."""
 
 
 class RefinedMask(NamedTuple):
@@ -181,10 +180,10 @@ class MaskRefiner:
         in front of the body, without the body.
         """
         stride, segmented = self._stride, track.mask.numpy()[crop]
-        parts = _wide_parts(segmented[::stride, ::stride] & ~surface[::stride, ::stride])
+        parts = _wide_parts(segmented[::stride, ::stride] & ~surface[::stride, ::stride], stride)
         if parts.any():  # seldom; the rest takes longer
             parts &= self._new_surface[self._cells(crop)] | self._earlier_surface(track, crop)
-            parts = _wide_parts(parts)
+            parts = _wide_parts(parts, stride)
         if not parts.any():
             return surface
         pixels = upsample_nearest(parts, stride, surface.shape).numpy()
@@ -230,10 +229,10 @@ def _dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     return dilate(torch.from_numpy(np.ascontiguousarray(mask)), pixels).numpy()
 
 
-def _wide_parts(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _wide_parts(cells: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:
     """Remove narrow parts from cells of the network's mask, (h, w): they are background along its coarse contour."""
-    opened = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, ellipse(_MIN_PART_RADIUS))
-    return np.asarray(opened).view(np.bool_)
+    kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
+    return cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
 
 
 def _components(region: NDArray[np.uint8]) -> tuple[int, NDArray[np.int32], Crop]:
