@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from v3d_torch.batch.batch_record import RUNS_TABLE, STUDY_TABLE
+from v3d_torch.batch.batch_folder import RUNS_TABLE, STUDY_TABLE
 from v3d_torch.batch.plan import check_configs
 from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config, SegmentationConfig

@@ -9,6 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rich.console import RenderableType
 
+from v3d_torch.batch.batch_folder import RUNS_TABLE
 from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.evaluation.outcome import Outcome
@@ -22,7 +23,6 @@ from v3d_torch.evaluation.summary import (
 from v3d_torch.evaluation.tables import ErrorTable
 from v3d_torch.io.files import write_text
 from v3d_torch.io.parquet_file import write_parquet
-from v3d_torch.runs.file_names import RunFile
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
@@ -39,12 +39,6 @@ METRIC_TYPES: Mapping[str, pa.DataType] = {
 
 The name of a column is the key with ``_`` instead of the dots.
 """
-
-RUNS_TABLE = "runs.parquet"
-"""Name of the table of the runs, which a batch writes before its first run."""
-
-STUDY_TABLE = "ablation.csv"
-"""Name of the table with all values, which an ablation study writes after its first run."""
 
 _SCHEMA = pa.schema(
     [
@@ -154,16 +148,6 @@ class BatchRecord:
     def screen_tables(self) -> list[RenderableType]:
         """Return the summary as tables for the screen, and their explanations."""
         return make_screen_tables(self._table_outcomes, self._absent)
-
-
-def has_batch(folder: Path) -> bool:
-    """Check whether a folder is that of a batch: it has the table of its runs from the start, or runs."""
-    return (folder / RUNS_TABLE).is_file() or next(folder.glob(f"*/*/seed*/{RunFile.LOG}"), None) is not None
-
-
-def has_study_only(folder: Path) -> bool:
-    """Check whether a folder is that of an ablation study. A reproduction has both tables."""
-    return (folder / STUDY_TABLE).is_file() and not (folder / RUNS_TABLE).is_file()
 
 
 def write_runs(path: Path, runs: Sequence[tuple[Job, Outcome]]) -> None:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from rich.console import Console, RenderableType
 
-from v3d_torch.batch.batch_record import STUDY_TABLE, BatchRecord
+from v3d_torch.batch.batch_folder import STUDY_TABLE
+from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from v3d_torch.batch.batch_record import BatchRecord, has_batch, has_study_only
+from v3d_torch.batch.batch_folder import has_batch, has_study_only
+from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.executor import Executor, JobFinished, JobRepeated
 from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare_stages
 from v3d_torch.batch.process_executor import ProcessExecutor

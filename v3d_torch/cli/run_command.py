@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from v3d_torch.batch.batch_record import RUNS_TABLE, STUDY_TABLE
+from v3d_torch.batch.batch_folder import describe_contents
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
@@ -256,13 +256,12 @@ def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> No
     if masks is not None and os.path.realpath(masks) in written:
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
     if not is_resumed:
+        if (contents := describe_contents(folder)) is not None:
+            raise OutputError(f"{folder}: contains {contents}; choose another folder with --out")
         resolved = Path(os.path.realpath(folder))
         above = resolved.parents[2:3] if resolved.match("seed*") else ()  # <batch>/<sequence>/<configuration>/seed<k>
-        for table, contents in ((RUNS_TABLE, "a batch"), (STUDY_TABLE, "an ablation study")):
-            if (folder / table).is_file():
-                raise OutputError(f"{folder}: contains {contents}; choose another folder with --out")
-            if any((parent / table).is_file() for parent in above):  # its tables would have the values of another run
-                raise OutputError(f"{folder}: is the folder of a run of {contents}; choose another folder with --out")
+        for contents in filter(None, map(describe_contents, above)):  # its tables would have the values of another run
+            raise OutputError(f"{folder}: is the folder of a run of {contents}; choose another folder with --out")
         find_earlier_results(folder)
 
 
