@@ -27,8 +27,9 @@ def check_lens(camera: PinholeCamera) -> list[str]:
     if not camera.is_distorted:
         return []
     v, u = torch.meshgrid(torch.arange(camera.height), torch.arange(camera.width), indexing="ij")
-    pixels = torch.stack([u, v], dim=-1).reshape(-1, 2).to(torch.float64)
-    error = (camera.distort(camera.undistort(pixels)) - pixels).norm(dim=1)
+    pixels = torch.stack([u, v], dim=-1).reshape(-1, 2)
+    rays = camera.rays.reshape(-1, 3).to(torch.float64)
+    error = (camera.distort(camera.project(rays)) - pixels).norm(dim=1)
     fraction = float((error > _MAX_ERROR).to(torch.float64).mean())
     if fraction < _MIN_FRACTION:
         return []
