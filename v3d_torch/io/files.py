@@ -63,6 +63,14 @@ def check_writable(path: Path) -> None:
         raise OutputError(f"{path}: cannot be written ({error.strerror}); choose another file") from error
 
 
+def file_size(path: Path) -> int | None:
+    """Return the size of a file, bytes; None if it cannot be read."""
+    try:
+        return path.stat().st_size
+    except (OSError, ValueError):  # ValueError if the name has a null character
+        return None
+
+
 def check_empty_folder(folder: Path) -> None:
     """Check that a folder is new or empty, so that no file is overwritten or mixed with others.
 

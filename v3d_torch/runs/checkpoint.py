@@ -18,6 +18,7 @@ from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.masks import MaskEvaluation
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.io.files import file_size
 from v3d_torch.io.state_file import read_state, write_state
 from v3d_torch.mapping.static_views import StaticView
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
@@ -88,15 +89,8 @@ class FileSizes:
         if not isinstance(self._sequence, RGBDSequence):
             return []
         for index in range(len(self._sizes), min(frames, len(self._sequence))):
-            self._sizes.append([_file_size(file) for file in _files(self._sequence, index)])
+            self._sizes.append([file_size(file) for file in _files(self._sequence, index)])
         return self._sizes[:frames]
-
-
-def _file_size(file: Path) -> int | None:
-    try:
-        return file.stat().st_size
-    except (OSError, ValueError):  # ValueError if the name has a null character
-        return None
 
 
 def write_checkpoint(

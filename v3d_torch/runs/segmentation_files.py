@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream
+from v3d_torch.io.files import file_size
 from v3d_torch.segmentation import MaskFolder
 from v3d_torch.segmentation.weights import sha256_of
 from v3d_torch.types import Segmenter
@@ -29,7 +30,7 @@ class SegmentationFiles:
         self._checksum = None if weights is None else sha256_of(Path(weights))
         self._masks = segment if isinstance(segment, MaskFolder) else None
         self._sequence = sequence
-        self._sizes: list[list[str | int] | None] = []
+        self._sizes: list[list[str | int | None] | None] = []
 
     def fingerprint(self, frames: int) -> dict[str, Any]:
         """Return plain values that distinguish the files of the first frames from others.
@@ -55,21 +56,13 @@ class SegmentationFiles:
             if before != now:
                 return self._masks.folder / (now or before)[0]
         labels = current["labels"]
-        return self._masks.folder / "labels.yaml" if fingerprint["labels"] != labels else None
+        return self._masks.labels_path if fingerprint["labels"] != labels else None
 
-    def _mask_sizes(self, frames: int) -> list[list[str | int] | None]:
+    def _mask_sizes(self, frames: int) -> list[list[str | int | None] | None]:
         """Return name and size in bytes of the id image of each of the first frames; None for a frame without one."""
         if self._masks is None or not isinstance(self._sequence, RGBDSequence):
             return []
         for index in range(len(self._sizes), min(frames, len(self._sequence))):
             path = self._masks.find_path(index, float(self._sequence.stamps[index]))
-            self._sizes.append(None if path is None else [path.name, _size(path)])
+            self._sizes.append(None if path is None else [path.name, file_size(path)])
         return self._sizes[:frames]
-
-
-def _size(path: Path) -> int:
-    """Return the size of a file, bytes; -1 if it cannot be read."""
-    try:
-        return path.stat().st_size
-    except OSError:
-        return -1

@@ -51,6 +51,7 @@ class MaskFolder:
     Attributes:
         folder: Folder of the id images.
         labels: COCO class of each id; None if all instances are people.
+        labels_path: Path of the file of the labels, also if there is none.
 
     Raises:
         InputError: If the folder is missing or contains no PNG file, or ``labels.yaml`` is invalid.
@@ -63,8 +64,9 @@ class MaskFolder:
             self._paths = [path for path in list_images(folder) if path.suffix.lower() == ".png"]
         if not self._paths:
             raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
-        labels = [path for name in ("labels.yaml", "labels.yml") if (path := folder / name).is_file()]
-        self.labels = _read_labels(labels[0]) if labels else None
+        names = "labels.yaml", "labels.yml"
+        self.labels_path = next((path for name in names if (path := folder / name).is_file()), folder / names[0])
+        self.labels = _read_labels(self.labels_path) if self.labels_path.is_file() else None
         stamps = [stamp for path in self._paths if (stamp := stamp_in_name(path)) is not None]
         self._stamps: Tensor | None = None
         self._max_gap = _MAX_GAP
