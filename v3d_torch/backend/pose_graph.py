@@ -256,11 +256,10 @@ def _prepare(
     T_ij, information = T_ij.to(torch.float64), information.to(torch.float64)
     edges = fill_indices("edges", edges, T_wc.shape[-3], None if valid is None else valid[..., None])
     if can_read(edges):
-        is_loop = edges[..., 0] == edges[..., 1]
-        if valid is not None:
-            is_loop = is_loop & valid
-        if bool(is_loop.any()):
-            pose = int(edges[..., 0].expand(is_loop.shape)[is_loop][0])
+        i, j = edges.unbind(dim=-1)
+        joins_itself = (i == j) & mask_or_all(valid, i)
+        if bool(joins_itself.any()):
+            pose = int(i.expand(joins_itself.shape)[joins_itself][0])
             raise InputError(f"edges joins pose {pose} to itself; give edges between two different poses")
     if valid is not None:
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])

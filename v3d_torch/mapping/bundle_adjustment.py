@@ -167,12 +167,12 @@ def sort_by_point(problem: BundleProblem, point_count: int) -> Iterator[tuple[ND
         yield order, (*(each.take(order, axis=-1) for each in row[:5]), of_points, np.flatnonzero(~row[6]))
 
 
-def _minimise_compiled(T_cw: Tensor, points: Tensor, *problem: Tensor, iterations: int, tolerance: float) -> _Minimum:
+def _minimise_compiled(T_cw: Tensor, points: Tensor, *columns: Tensor, iterations: int, tolerance: float) -> _Minimum:
     batch = T_cw.shape[:-3]
     if 0 in batch:
         return NotImplemented
     settings = iterations, tolerance, SCHUR_REGULARISATION, MIN_DEPTH, DAMPING_SCHEDULE
-    problems = sort_by_point(BundleProblem(*problem), points.shape[-2])
+    problems = sort_by_point(BundleProblem(*columns), points.shape[-2])
     results = []
     for T, X, (order, arguments) in zip(to_rows(T_cw, batch), to_rows(points, batch), problems, strict=True):
         *moved, squared, cost_before, cost_after, steps = kernels.bundle_adjust(T, X, *arguments, *settings)
@@ -184,11 +184,11 @@ def _minimise_compiled(T_cw: Tensor, points: Tensor, *problem: Tensor, iteration
 
 @torch.no_grad()
 @compiled_by(_minimise_compiled)
-def _minimise(T_cw: Tensor, points: Tensor, *problem: Tensor, iterations: int, tolerance: float) -> _Minimum:
+def _minimise(T_cw: Tensor, points: Tensor, *columns: Tensor, iterations: int, tolerance: float) -> _Minimum:
     """Minimise the robust cost of a `BundleProblem`, without gradients."""
-    at = BundleProblem(*problem)
-    found = levenberg_marquardt((T_cw, points), at.residuals_at, at.step, iterations, tolerance)
-    return _Minimum(*found.state, at.chi2(found.system), found.cost_before, found.cost_after, found.iterations)
+    problem = BundleProblem(*columns)
+    found = levenberg_marquardt((T_cw, points), problem.residuals_at, problem.step, iterations, tolerance)
+    return _Minimum(*found.state, problem.chi2(found.system), found.cost_before, found.cost_after, found.iterations)
 
 
 class BundleAdjuster(torch.nn.Module):

@@ -148,12 +148,12 @@ def combine_readouts(
 
 
 def _reduced_cost_derivatives_compiled(
-    T_cw: Tensor, points: Tensor, derivative: Tensor, *problem: Tensor
+    T_cw: Tensor, points: Tensor, derivative: Tensor, *columns: Tensor
 ) -> tuple[Tensor, Tensor]:
     batch = T_cw.shape[:-3]
     if 0 in batch:
         return NotImplemented
-    problems = sort_by_point(BundleProblem(*problem), points.shape[-2])
+    problems = sort_by_point(BundleProblem(*columns), points.shape[-2])
     poses, landmarks, derivatives = to_rows(T_cw, batch), to_rows(points, batch), to_rows(derivative.mT, batch)
     settings = NEGLIGIBLE_DAMPING, SCHUR_REGULARISATION, MIN_DEPTH
     results = [
@@ -166,7 +166,7 @@ def _reduced_cost_derivatives_compiled(
 
 @compiled_by(_reduced_cost_derivatives_compiled)
 def reduced_cost_derivatives(
-    T_cw: Tensor, points: Tensor, derivative: Tensor, *problem: Tensor
+    T_cw: Tensor, points: Tensor, derivative: Tensor, *columns: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the minimum cost of a bundle adjustment with respect to a parameter of the measurements.
 
@@ -176,14 +176,14 @@ def reduced_cost_derivatives(
         T_cw: Poses at the minimum, float64, shape :math:`(..., P, 4, 4)`.
         points: Landmarks at the minimum, float64, shape :math:`(..., L, 3)`.
         derivative: Derivative :math:`j` of the whitened residuals, shape :math:`(..., 3, M)`.
-        problem: Columns of the `BundleProblem`.
+        columns: Columns of the `BundleProblem`.
 
     Returns:
         First and second derivative of the minimum cost, shape :math:`(...)` each.
     """
-    at = BundleProblem(*problem)
-    _, residuals = at.residuals_at((T_cw, points))
-    weighted = 2 * residuals.weights[..., None, :] * at.remaining(residuals, derivative, points.shape[-2])
+    problem = BundleProblem(*columns)
+    _, residuals = problem.residuals_at((T_cw, points))
+    weighted = 2 * residuals.weights[..., None, :] * problem.remaining(residuals, derivative, points.shape[-2])
     return (weighted * residuals.whitened).sum(dim=(-2, -1)), (weighted * derivative).sum(dim=(-2, -1))
 
 

@@ -142,7 +142,7 @@ class StaticViews(StatefulComponent):
         check_masks(static=static)
         KORNIA_CHECK_SHAPE(image, ["3", *self._size])
         KORNIA_CHECK_SHAPE(depth, ["1", *self._size])
-        KORNIA_CHECK_SHAPE(static, [*self._size])
+        KORNIA_CHECK_SHAPE(static, list(self._size))
         T_dc = torch.eye(4, dtype=torch.float64) if T_dc is None else T_dc
         units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)
