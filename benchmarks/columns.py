@@ -170,6 +170,7 @@ TRACKS = {
     "tracks": "tracks (people)",
     "position": "position error, cm",
     "velocity": "velocity error, m/s",
+    "velocity_from_truth": "from true positions, m/s",
     "nees": "normalised errors of position and velocity, expected 3",
     "positions": "positions",
 }

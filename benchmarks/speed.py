@@ -17,14 +17,13 @@ from statistics import mean
 from command import add_vocabulary_option, make_parser, publish
 from heading import make_heading
 from sequences import locate_sequence, trained_vocabulary
-from storage import Measurement, Row
+from storage import Measurement, Row, file_of
 from systems import OURS, PEERS
 from systems.process import Measured, SystemRunError, measure
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import V3DError
 from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
-from v3d_torch.segmentation.quantise import has_int8_instructions
 
 REFERENCE = "pyorbslam3"
 SYSTEMS = (*OURS, *PEERS)
@@ -139,11 +138,6 @@ def stage_table(turns: Sequence[Turn]) -> Iterator[str]:
     times = {(cells["system"], cells["stage"]): cells["ms"] for cells in stage_times(turns)}
     for stage in dict.fromkeys(stage for _, stage in times):
         yield markdown_row([stage, *(times.get((name, stage), "-") for name in OURS)])
-
-
-def file_of(name: str) -> str:
-    """Return the file of a measurement: processors without 8-bit vector instructions have files of their own."""
-    return name if has_int8_instructions() else f"{name}_float32"
 
 
 def failures(turns: Sequence[Turn]) -> Iterator[str]:

@@ -15,6 +15,7 @@ from pathlib import Path
 from heading import Heading
 
 from v3d_torch.io.files import write_text
+from v3d_torch.segmentation.quantise import has_int8_instructions
 
 RESULTS = Path(__file__).with_name("results")
 
@@ -44,6 +45,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "stages": ("sequence", "stage"),
     "stages_float32": ("sequence", "stage"),
     "tracks": ("sequence", "tracker"),
+    "tracks_float32": ("sequence", "tracker"),
     "voting_thresholds": ("sequence", "rule", "numbers"),
 }
 """Cells that identify a row, by the name of the file."""
@@ -64,6 +66,11 @@ class Measurement:
     heading: Heading
     rows: Sequence[Row]
     notes: Sequence[str] = ()
+
+
+def file_of(name: str) -> str:
+    """Return the file of a measurement: processors without 8-bit vector instructions have files of their own."""
+    return name if has_int8_instructions() else f"{name}_float32"
 
 
 def load(name: str, folder: Path = RESULTS) -> list[Measurement]:

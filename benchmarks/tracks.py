@@ -14,7 +14,7 @@ import torch
 from command import make_parser, publish
 from heading import make_heading
 from sequences import locate_sequence, table_name
-from storage import Measurement, Row
+from storage import Measurement, Row, file_of
 from systems.box_trackers import PEERS, SETTINGS, BoxTracker
 from tables import flat
 from track_evaluation.motion import MotionErrors, MotionScores, format_scores
@@ -123,7 +123,8 @@ ABOUT = (
     " tracks have the masks of the detections that they were given. Peers run with their defaults and with lower score"
     " thresholds; the better result is shown. Errors of position and velocity are medians of people fully in view: the"
     " true position is the mean of the visible surface in the true mask, the true velocity its change over half a"
-    " second in the ground-truth world. Normalised errors are squared errors divided by the variances of the filter."
+    " second in the ground-truth world. A velocity from true positions is that of the last 0.3 s. Normalised errors are"
+    " squared errors divided by the variances of the filter."
 )
 
 
@@ -144,7 +145,7 @@ def main() -> None:
     except V3DError as error:
         parser.error(str(error))
     lines = ["# Tracks of people", "", *heading.lines(), "", *flat(rows, columns.TRACKS), "", ABOUT]
-    publish(lines, options, parser, {"tracks": Measurement(heading, rows)})
+    publish(lines, options, parser, {file_of("tracks"): Measurement(heading, rows)})
 
 
 if __name__ == "__main__":

@@ -164,6 +164,24 @@ def test_velocity_of_a_part_is_known_sooner_than_the_place_of_the_whole() -> Non
     assert motion.visible_state.sigmas[0] < NOISE
 
 
+def test_centroid_of_the_surface_replaces_the_visible_position_only() -> None:
+    corrected, other = (ConstantVelocityKalmanFilter(TrackerConfig()) for _ in range(2))
+    surface = torch.tensor([0.1, 0.2, 2.1], dtype=torch.float64)
+    for frame in range(5):
+        for motion in (corrected, other):
+            motion.update(frame / 30, torch.tensor([frame / 30, 0.0, 2.0], dtype=torch.float64), 0.1)
+        before = corrected.visible_state
+        assert torch.equal(before.position, other.visible_state.position)
+        corrected.correct_visible_position(surface)
+        state = corrected.visible_state
+        assert torch.equal(state.position, surface) and torch.equal(state.velocity, before.velocity)
+        assert torch.equal(corrected.state.position, other.state.position)
+        # Position and velocity are as correlated as before, so that the covariance stays positive definite.
+        torch.linalg.cholesky(state.covariance)
+        correlations = [each.variances[1] / math.prod(each.sigmas) for each in (state, before)]
+        assert correlations[0] == pytest.approx(correlations[1])
+
+
 def make_state() -> ObjectState:
     position, velocity = torch.rand(2, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     return ObjectState(1.0, position, velocity, (1.0, 0.1, 2.0), 1.5)

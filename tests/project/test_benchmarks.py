@@ -392,12 +392,12 @@ class TestPage:
         assert "| v3d_torch | 20.0 (90.0) | 0.50 |" in page
         assert "| **0.017** |" in write_page.main_tables(tmp_path)
 
-    @pytest.mark.parametrize(("has_int8", "file"), [(True, "stages"), (False, "stages_float32")])
-    def test_each_kind_of_processor_has_its_own_speeds(
+    @pytest.mark.parametrize(("has_int8", "file"), [(True, "tracks"), (False, "tracks_float32")])
+    def test_each_kind_of_processor_has_its_own_files(
         self, has_int8: bool, file: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(speed, "has_int8_instructions", lambda: has_int8)
-        assert speed.file_of("stages") == file
+        monkeypatch.setattr(storage, "has_int8_instructions", lambda: has_int8)
+        assert storage.file_of("tracks") == file
         assert file in storage.KEYS
 
     def test_table_of_speed_has_a_row_for_every_measured_system(self) -> None:

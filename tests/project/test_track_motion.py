@@ -62,6 +62,7 @@ def test_errors_are_those_of_the_track_in_any_world() -> None:
     assert found.count == 20
     assert found.position == pytest.approx(0.05, abs=0.03)  # a pixel is 5 cm
     assert found.velocity == pytest.approx(0.0, abs=0.12)
+    assert found.velocity_from_truth == pytest.approx(0.0, abs=0.12)
     # The true positions are those of the pixels. The true velocity is that from two frames before to two frames after.
     # The first and the last velocity are those of three frames.
     frame = torch.arange(1, 19)

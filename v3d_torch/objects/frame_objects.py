@@ -39,14 +39,16 @@ class TrackedObject:
             empty if these cover most of it, or if the object is hidden, not confirmed, or missed for more than 0.1 s,
             because later predictions are seldom right. ``static_mask`` of `FrameObjects` still excludes all predicted
             pixels.
-        state: Position of the visible part and velocity, with their covariance, at the time of the frame.
+        state: Position of the visible part and velocity, with their covariance, at the time of the frame. The position
+            is the centroid of the surface in a refined mask, otherwise that of the cloud.
         history: States of the last 10 s, at most one in 0.1 s, oldest first.
         votes: Number of votes in this frame, maximum over the time spans; the free-space check has one vote.
         chamfer: Root-mean-square nearest-neighbour distance to the earlier cloud, metres; NaN if it was not measured,
             for example because the object is dynamic.
         motion_state: Static, dynamic, deforming or unknown.
         missed: True if the network did not detect the object in this frame, so that mask and centroid are predicted.
-        cloud: Point cloud of the last detection, world frame, metres, float32, shape :math:`(P, 3)`.
+        cloud: Point cloud of the last detection, world frame, metres, float32, shape :math:`(P, 3)`; that of a missed
+            object moves with its prediction.
     """
 
     id: int
@@ -98,15 +100,10 @@ class FrameObjects:
     def boxes(self, up: Tensor) -> dict[int, UprightBox]:
         """Compute the upright box of each object that has a cloud and a centroid, by id.
 
-        The cloud of a missed object is moved to the predicted centroid.
-
         Args:
             up: Direction against gravity, world frame, shape :math:`(3,)`, such as `V3DSLAM.up`.
         """
         with_centroid = [each for each in self.objects if len(each.cloud) and each.state.is_known]
-        clouds = [
-            each.cloud + (each.centroid - each.cloud.double().mean(dim=0)) if each.missed else each.cloud
-            for each in with_centroid
-        ]
+        clouds = [each.cloud for each in with_centroid]
         boxes = upright_boxes(clouds, up, [each.state.velocity for each in with_centroid])
         return {each.id: box for each, box in zip(with_centroid, boxes, strict=True)}

@@ -17,6 +17,10 @@ _INITIAL_SPEED_SIGMA = 1.0
 _CENTROID_SIGMA = 0.04
 """Standard deviation of a measured centroid of the visible part, metres: noise of depth and of the contour."""
 
+_SURFACE_SIGMA = 0.035
+"""Standard deviation of the centroid of the surface in a refined mask, metres: such a mask misses fewer parts than the
+cloud of an object."""
+
 _SLOW_FRACTION, _SLOW_TIME = 0.5, 2.0
 """Fraction of the variance of the offset that changes slowly, because the same part is visible in consecutive frames,
 and its time constant, seconds: within seconds a person turns, or others walk by. The rest differs in each frame,
@@ -81,6 +85,18 @@ class ConstantVelocityKalmanFilter:
             self._correct(position)
         else:
             self._start(stamp, position, sigma)
+
+    def correct_visible_position(self, position: Tensor) -> None:
+        """Replace the position in the visible state by the centroid of the surface in a refined mask, of the same time.
+
+        It changes neither the estimate for the whole object nor later states: ids compare centroids of clouds.
+
+        Args:
+            position: Centroid of the surface, world frame, metres, float64, shape :math:`(3,)`.
+        """
+        pp, pv, vv = self.visible_state.variances
+        variances = _SURFACE_SIGMA**2, pv * _SURFACE_SIGMA / math.sqrt(pp), vv
+        self.visible_state = replace(self.visible_state, position=position, variances=variances)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the state into the corrected world frame.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from math import isnan
 from typing import Any
@@ -19,7 +19,7 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedOb
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.instance_tracker import InstanceTracker
 from v3d_torch.objects.mask_propagation import propagate_instances
-from v3d_torch.objects.mask_refiner import MaskRefiner
+from v3d_torch.objects.mask_refiner import MaskRefiner, RefinedMask
 from v3d_torch.objects.motion_evidence import (
     DetectionPairs,
     chamfer_evidence,
@@ -28,8 +28,9 @@ from v3d_torch.objects.motion_evidence import (
     hough_vote_evidence,
 )
 from v3d_torch.objects.newly_occupied import NewlyOccupied
-from v3d_torch.objects.static_mask import StaticMasks, static_masks
+from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.static_surfaces import StaticSurfaces
+from v3d_torch.objects.surface_centroids import SurfaceCentroids
 from v3d_torch.objects.track import Track
 from v3d_torch.objects.visible_masks import visible_masks
 from v3d_torch.runtime.stateful import StatefulComponent
@@ -67,6 +68,7 @@ class MotionClassifier(StatefulComponent):
         self._config = config
         self._camera = camera
         self._last_stamp = -torch.inf
+        self._surface_centroids = SurfaceCentroids(config.clouds, camera)
         self.tracker = InstanceTracker(config.tracker, camera, config.clouds)
         self.static_surfaces = StaticSurfaces(config.free_space, camera)
 
@@ -127,7 +129,14 @@ class MotionClassifier(StatefulComponent):
             track.mark_supported(stamp, is_supported)
         motion_states = {track: self._motion_state(track, free_space.appeared[track], stamp) for track in tracks}
 
-        masks, visible = self._masks(motion_states, view, newly_occupied)
+        # Masks, refined by depth, and the positions that they show.
+        excluded = [track for track in tracks if not self._is_trackable(motion_states[track])]
+        refined = self._refine_masks(excluded, tracks, view, newly_occupied)
+        size = view.missing.shape
+        masks = static_masks([refined[track] for track in excluded], list(refined.values()), size, config.static_mask)
+        visible = visible_masks(tracks, refined, view.missing)
+        self._record_visible_states(dict(zip(tracks, visible, strict=True)), refined, view)
+
         objects = [
             TrackedObject(
                 id=track.id,
@@ -172,19 +181,25 @@ class MotionClassifier(StatefulComponent):
         """
         return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds)
 
-    def _masks(
-        self, motion_states: Mapping[Track, MotionState], view: DepthView, newly_occupied: NewlyOccupied
-    ) -> tuple[StaticMasks, list[Tensor]]:
-        """Return the static masks of the frame, and the visible pixels of each object, bool, (H, W) each."""
-        # Most excluded objects are people, and each mask is refined once.
-        excluded = [track for track, motion_state in motion_states.items() if not self._is_trackable(motion_state)]
-        people = [track for track in motion_states if track.label == PERSON]
-        tracks = list(dict.fromkeys([*excluded, *people]))
-        refiner = MaskRefiner(tracks, view, newly_occupied, self.static_surfaces, self._config, self._camera)
-        refined = {track: refiner.refine(track) for track in tracks}
-        size, config = view.missing.shape, self._config.static_mask
-        masks = static_masks([refined[track] for track in excluded], list(refined.values()), size, config)
-        return masks, visible_masks(list(motion_states), refined, view.missing)
+    def _refine_masks(
+        self, excluded: Sequence[Track], tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied
+    ) -> dict[Track, RefinedMask]:
+        """Return the refined masks of the excluded objects and of all people; most excluded objects are people."""
+        people = [track for track in tracks if track.label == PERSON]
+        refinable = list(dict.fromkeys([*excluded, *people]))
+        refiner = MaskRefiner(refinable, view, newly_occupied, self.static_surfaces, self._config, self._camera)
+        return {track: refiner.refine(track) for track in refinable}
+
+    def _record_visible_states(
+        self, visible: Mapping[Track, Tensor], refined: Container[Track], view: DepthView
+    ) -> None:
+        """Record the states of the detected objects, with the positions that refined masks show."""
+        detected = [track for track in visible if not track.missed]
+        measured = [track for track in detected if track in refined]
+        positions = self._surface_centroids(view, [visible[track] for track in measured])
+        position = dict(zip(measured, positions, strict=True))
+        for track in detected:
+            track.record_visible_state(position.get(track))
 
     def _deformation_candidates(self, pairs: DetectionPairs, stamp: float) -> DetectionPairs:
         """Return the pairs of living objects that are not dynamic: Chamfer distances refine the vote (Sec. I)."""
@@ -262,4 +277,9 @@ class MotionClassifier(StatefulComponent):
 
 def _world_attributes(track: Track, stamp: float) -> dict[str, Any]:
     """Return the attributes of a `TrackedObject` in the world frame."""
-    return {"state": track.predict_visible_state(stamp), "history": tuple(track.history), "cloud": track.newest.cloud}
+    cloud = track.newest.cloud
+    return {
+        "state": track.predict_visible_state(stamp),
+        "history": tuple(track.history),
+        "cloud": cloud + track.predict_motion(stamp).to(cloud.dtype) if track.missed else cloud,
+    }

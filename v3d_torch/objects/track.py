@@ -267,10 +267,23 @@ class Track:
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
         self.vacant_time = self.vacancy = 0.0
-        self._append_state()
         self.detections.append(detection)
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
+
+    def record_visible_state(self, surface_centroid: Tensor | None) -> None:
+        """Record the state of the visible part after a detection: at the rate of the history, for a limited time.
+
+        Args:
+            surface_centroid: Centroid of the surface in the refined mask, world frame, metres, float64, shape
+                :math:`(3,)`, which becomes the position; None if the mask was not refined.
+        """
+        if surface_centroid is not None and self.newest.has_centroid:
+            self._filter.correct_visible_position(surface_centroid)
+        state = self._filter.visible_state
+        if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
+            oldest = state.stamp - _STATE_HISTORY
+            self.history = [each for each in self.history if each.stamp >= oldest] + [state]
 
     def add_vacancy(self, stamp: float, seconds: float) -> None:
         """Record that the predicted place was observed to be empty.
@@ -399,13 +412,6 @@ class Track:
 
     def _predict_stop(self, state: ObjectState, stamp: float) -> ObjectState:
         return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
-
-    def _append_state(self) -> None:
-        """Append the state to the history, at the rate of the history, and drop the states that are too old."""
-        state = self._filter.visible_state
-        if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
-            oldest = state.stamp - _STATE_HISTORY
-            self.history = [each for each in self.history if each.stamp >= oldest] + [state]
 
 
 def predict_clouds(tracks: Sequence[Track], stamp: float, T_cw: Tensor) -> list[Tensor]:
