@@ -21,7 +21,6 @@ from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.kernels.dbscan import MAX_CELLS
 from v3d_torch.objects.dbscan import dbscan
 from v3d_torch.objects.largest_clusters import largest_clusters
-from v3d_torch.objects.mask_points import back_project_masks
 from v3d_torch.objects.resampling import upsample_nearest
 from v3d_torch.types import Instances
 
@@ -97,7 +96,7 @@ def _compute_clouds_compiled(
 @compiled_by(_compute_clouds_compiled)
 def _compute_clouds(depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig) -> InstanceClouds:
     """Compute the clouds of masks (N, H, W) of a depth image (H, W), with the rays (R, 3) of every n-th pixel."""
-    points, valid, pixel = back_project_masks(depth, masks, rays, config)
+    points, valid, pixel = _back_project(depth, masks, rays, config)
     points, valid, _, voxel = voxel_pool(points, valid, config.voxel_size)
     labels = dbscan(points, valid, config.eps, config.min_samples)
     # The paper keeps as many clusters as there are instances. Here each instance has its own cloud.
@@ -133,3 +132,22 @@ def _cloud_pixels(masks: Tensor, valid: Tensor, voxel: Tensor, pixel: Tensor, st
     instance, point = torch.nonzero(voxel >= 0, as_tuple=True)
     cells.flatten(1)[instance, pixel[instance, point]] = valid[instance, voxel[instance, point]]
     return upsample_nearest(cells.numpy(), stride, masks.shape[-2:]) & masks
+
+
+def _back_project(
+    depth: Tensor, masks: Tensor, rays: NDArray[np.float32], config: CloudConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Back-project every n-th masked pixel with depth.
+
+    Returns:
+        Points :math:`(N, P, 3)`, their validity :math:`(N, P)`, and their row-major pixel indices :math:`(N, P)`.
+    """
+    stride = config.stride
+    z = depth[::stride, ::stride].numpy()
+    selected = masks.numpy()[:, ::stride, ::stride] & ((z > 0) & (z <= config.max_depth))
+    count = np.count_nonzero(selected, axis=(1, 2))
+    valid = np.arange(max(count.max(initial=0), 1)) < count[:, None]
+    pixel = np.flatnonzero(selected) % z.size
+    pixels, points = np.zeros(valid.shape, np.int64), np.zeros((*valid.shape, 3), np.float32)
+    pixels[valid], points[valid] = pixel, rays[pixel] * z.ravel()[pixel, None]
+    return torch.from_numpy(points), torch.from_numpy(valid), torch.from_numpy(pixels)

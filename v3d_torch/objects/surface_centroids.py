@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert, transform_points
+from v3d_torch.geometry.se3 import invert
 from v3d_torch.geometry.voxel import voxel_pool
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.mask_points import back_project_masks
 
 _VOXEL_SIZE = 0.05
 """Side of the voxels over which a centroid averages, metres. They are larger than the distances between the points, so
@@ -48,13 +49,22 @@ class SurfaceCentroids:
         Returns:
             Centroids, world frame, metres, float64, each of shape :math:`(3,)`; None for a mask without depth.
         """
-        if not masks:
-            return []
-        points, valid, _ = back_project_masks(view.depth[0], torch.stack(list(masks)), self._rays, self._config)
-        z = points[..., 2]
-        median = z.masked_fill(~valid, torch.nan).nanmedian(dim=1, keepdim=True).values
-        means, is_voxel, *_ = voxel_pool(points, valid & ((z - median).abs() < _MAX_DEPTH_OFFSET), _VOXEL_SIZE)
-        count = is_voxel.sum(dim=1)
-        centroids = means.to(torch.float64).sum(dim=1) / count[:, None]
-        in_world = transform_points(invert(view.T_dw), centroids)
-        return [each if known else None for each, known in zip(in_world, (count > 0).tolist(), strict=True)]
+        stride = self._config.stride
+        depth, T_wd = np.ascontiguousarray(view.depth.numpy()[0, ::stride, ::stride]), invert(view.T_dw)
+        is_known = (depth > 0) & (depth <= self._config.max_depth)
+        pixels = [np.flatnonzero(mask.numpy()[::stride, ::stride] & is_known) for mask in masks]
+        surfaces = [self._surface(each, depth.ravel()[each]) for each in pixels]
+        return [T_wd[:3, :3] @ _centroid(each) + T_wd[:3, 3] if len(each) else None for each in surfaces]
+
+    def _surface(self, pixels: NDArray[np.intp], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the points (P, 3) of the pixels (R,) whose depth (R,) is near their median depth."""
+        # NumPy is faster here than torch: a frame has a few small surfaces.
+        near = np.abs(depth - np.median(depth)) < _MAX_DEPTH_OFFSET if len(depth) else slice(0)
+        return np.asarray(self._rays[pixels[near]] * depth[near, None])
+
+
+def _centroid(surface: NDArray[np.float32]) -> Tensor:
+    """Return the mean of the voxels of a surface, float64, shape (3,)."""
+    points = torch.from_numpy(surface)[None]
+    voxels = voxel_pool(points, torch.ones(points.shape[:2], dtype=torch.bool), _VOXEL_SIZE)
+    return voxels.means[0].to(torch.float64).mean(dim=0)
