@@ -92,5 +92,5 @@ def test_check_shapes_returns_the_batch_of_arguments_whose_named_sizes_are_equal
 
 
 def test_check_shapes_rejects_a_named_size_that_differs() -> None:
-    with pytest.raises(ShapeError, match="expected 5, got 4"):
+    with pytest.raises(ShapeError, match=r"^weights has the shape \(4,\); give a tensor of shape \(\.\.\., 5\)$"):
         check_shapes(uv=(torch.zeros(5, 2), "N", 2), weights=(torch.ones(4), "N"))

@@ -3,9 +3,33 @@
 from __future__ import annotations
 
 import torch
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
+
+
+def check_shape(name: str, value: object, *dimensions: int | str) -> None:
+    """Check the shape of an argument, also if the checks of Kornia are disabled: kernels do not check their indices.
+
+    Args:
+        name: Name of the argument.
+        value: Tensor.
+        dimensions: Sizes; a letter for any size; ``"*"`` first for any number of leading dimensions.
+
+    Raises:
+        InputError: If the value is no tensor.
+        ShapeError: If it has another shape.
+    """
+    expected = f"({', '.join('...' if d == '*' else str(d) for d in dimensions)})"
+    if not isinstance(value, Tensor):
+        raise InputError(f"{name} is of type {type(value).__name__}; give a torch.Tensor of shape {expected}")
+    last = dimensions[1:] if dimensions[:1] == ("*",) else dimensions
+    has_dimensions = value.ndim == len(last) or (last is not dimensions and value.ndim > len(last))
+    sizes = value.shape[value.ndim - len(last) :]
+    if not has_dimensions or any(isinstance(d, int) and d != size for d, size in zip(last, sizes, strict=True)):
+        message = f"{name} has the shape {tuple(value.shape)}; give a tensor of shape {expected}"
+        raise ShapeError(message, actual_shape=list(value.shape), expected_shape=[str(d) for d in dimensions])
 
 
 def check_masks(**masks: object) -> None:

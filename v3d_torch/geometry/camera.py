@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import cast
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_shape
 from v3d_torch.geometry.distortion import (
     DistortionModel,
     complete_distortion,
@@ -318,8 +318,8 @@ def back_project(depth: Tensor, rays: Tensor) -> Tensor:
         Points in the camera frame, metres, dtype of ``depth``, float32 for integers, shape :math:`(B, H, W, 3)`;
         (0, 0, 0) where the depth is 0, and not finite where it is not. Differentiable in ``depth`` and ``rays``.
     """
-    KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
-    KORNIA_CHECK_SHAPE(rays, ["*", *map(str, depth.shape[2:]), "3"])
+    check_shape("depth", depth, "B", 1, "H", "W")
+    check_shape("rays", rays, "*", *depth.shape[2:], 3)
     return rays.to(depth.device, result_dtype(depth.dtype)) * depth[:, 0, :, :, None]
 
 

@@ -6,11 +6,10 @@ import math
 
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_not_negative, check_positive
+from v3d_torch.geometry.argument_checks import check_not_negative, check_positive, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -65,7 +64,7 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     """
     check_positive(sigma=sigma)
     check_not_negative(edge_ratio=edge_ratio)
-    KORNIA_CHECK_SHAPE(depth, ["B", "1", "H", "W"])
+    check_shape("depth", depth, "B", 1, "H", "W")
     if kernel_size < 1 or kernel_size % 2 == 0:
         raise ConfigError(f"kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
     radius = kernel_size // 2

@@ -6,12 +6,11 @@ from itertools import product
 
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import pad
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_not_negative
+from v3d_torch.geometry.argument_checks import check_not_negative, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import normals as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -54,7 +53,7 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
     check_not_negative(edge_ratio=edge_ratio)
     if radius < 0:
         raise ConfigError(f"radius is {radius}; give a number of pixels of at least 0")
-    KORNIA_CHECK_SHAPE(points, ["B", "H", "W", "3"])
+    check_shape("points", points, "B", "H", "W", 3)
     dtype, points = result_dtype(points.dtype), points.to(working_dtype(points.dtype))
     z = points[..., 2]
     # The products below mask these points, too, but their derivatives would make the gradients of neighbours NaN.

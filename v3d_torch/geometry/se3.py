@@ -11,9 +11,9 @@ Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, 
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_shape
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
@@ -177,7 +177,7 @@ def se3_exp(xi: Tensor) -> Tensor:
     Returns:
         Rigid motions, dtype of ``xi``, float32 for integers, shape :math:`(..., 4, 4)`.
     """
-    KORNIA_CHECK_SHAPE(xi, ["*", "6"])
+    check_shape("xi", xi, "*", 6)
     dtype, xi = result_dtype(xi.dtype), xi.to(working_dtype(xi.dtype))
     X = hat(xi)
     # Below the small angle the coefficients are constant to float64, and are multiplied by high powers of the angle.
@@ -208,7 +208,7 @@ def se3_log(T: Tensor) -> Tensor:
         Tangent vectors ``[translation, rotation]``, metres and radians, dtype of ``T``, float32 for integers, shape
         :math:`(..., 6)`, with a rotation angle in [0, pi].
     """
-    KORNIA_CHECK_SHAPE(T, ["*", "4", "4"])
+    check_shape("T", T, "*", 4, 4)
     dtype, T = result_dtype(T.dtype), T.to(working_dtype(T.dtype))
     phi = _so3_log(T[..., :3, :3])
     square = (phi * phi).sum(dim=-1)[..., None, None]

@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.argument_checks import check_masks, check_positive, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
@@ -76,8 +75,8 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
             ``valid`` is not bool.
     """
     check_masks(valid=valid)
-    KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
-    KORNIA_CHECK_SHAPE(valid, [str(length) for length in points.shape[:2]])
+    check_shape("points", points, "B", "N", 3)
+    check_shape("valid", valid, *points.shape[:2])
     check_positive(size=size)
     voxel_index, occupied = _number_voxels(points.detach().to(working_dtype(points.dtype)), valid, size)
     batch, count = valid.shape

@@ -7,11 +7,10 @@ from copy import copy
 from dataclasses import dataclass
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import STORED_UNIT
 from v3d_torch.geometry.se3 import invert
@@ -81,7 +80,7 @@ class StaticViews(StatefulComponent):
         if stride < 1:
             raise ConfigError(f"stride is {stride}; give a number of pixels of at least 1")
         self.stride = stride
-        self._size = str(camera.height), str(camera.width)
+        self._size = camera.height, camera.width
         self.camera = PinholeCamera(
             fx=camera.fx / stride,
             fy=camera.fy / stride,
@@ -140,9 +139,9 @@ class StaticViews(StatefulComponent):
             InputError: If ``static`` is not bool.
         """
         check_masks(static=static)
-        KORNIA_CHECK_SHAPE(image, ["3", *self._size])
-        KORNIA_CHECK_SHAPE(depth, ["1", *self._size])
-        KORNIA_CHECK_SHAPE(static, list(self._size))
+        check_shape("image", image, 3, *self._size)
+        check_shape("depth", depth, 1, *self._size)
+        check_shape("static", static, *self._size)
         T_dc = torch.eye(4, dtype=torch.float64) if T_dc is None else T_dc
         units = (depth[0, self._v, self._u] / STORED_UNIT).round()
         keep = self._inside & static[self._v, self._u] & (units > 0) & (units < 2**16)

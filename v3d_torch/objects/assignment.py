@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import scipy.optimize  # loaded here: `scipy` alone would load it while the first frame is tracked
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.kernels.compiler import can_read
 
 
@@ -31,13 +30,13 @@ def match_instances(log_ratio: Tensor, tracked: Tensor | None = None, present: T
         InputError: If a mask is not bool, or a ratio that is not padding is NaN or plus infinity.
     """
     check_masks(tracked=tracked, present=present)
-    KORNIA_CHECK_SHAPE(log_ratio, ["B", "T", "N"])
+    check_shape("log_ratio", log_ratio, "B", "T", "N")
     gain = log_ratio.detach().to(torch.float64).clamp(min=0)
     if tracked is not None:
-        KORNIA_CHECK_SHAPE(tracked, [str(size) for size in gain.shape[:2]])
+        check_shape("tracked", tracked, *gain.shape[:2])
         gain = torch.where(tracked[..., :, None], gain, 0.0)
     if present is not None:
-        KORNIA_CHECK_SHAPE(present, [str(size) for size in gain.shape[::2]])
+        check_shape("present", present, *gain.shape[::2])
         gain = torch.where(present[..., None, :], gain, 0.0)
     return _assign(gain) if can_read(gain) else _assign_on_host(gain)
 

@@ -7,12 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import cv2
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels.compiler import can_read
 
@@ -55,8 +54,11 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
         InputError: If a coordinate of a valid point is not finite or exceeds 1e18 m, or if a mask is not bool.
     """
     check_masks(p_valid=p_valid, q_valid=q_valid)
-    KORNIA_CHECK_SHAPE(p, ["B", "N", "3"])
-    KORNIA_CHECK_SHAPE(q, [str(p.shape[0]), "M", "3"])
+    check_shape("p", p, "B", "N", 3)
+    check_shape("q", q, p.shape[0], "M", 3)
+    for name, valid, cloud in (("p_valid", p_valid, p), ("q_valid", q_valid, q)):
+        if valid is not None:
+            check_shape(name, valid, *cloud.shape[:2])
     p_valid, q_valid = _mask(p, p_valid), _mask(q, q_valid)
     dtype = p.dtype
     # Padding is set to the origin: NaN would reach the gradients.
@@ -77,10 +79,7 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
 
 def _mask(points: Tensor, valid: Tensor | None) -> Tensor:
     """Mask of the points that are not padding, (B, N)."""
-    if valid is None:
-        return torch.ones_like(points[..., 0], dtype=torch.bool)
-    KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
-    return valid
+    return torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid
 
 
 def _mean_square(points: Tensor, others: Tensor, nearest: Tensor, valid: Tensor, others_valid: Tensor) -> Tensor:

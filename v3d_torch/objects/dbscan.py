@@ -7,12 +7,11 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 import scipy
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.kernels import dbscan as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
@@ -79,8 +78,8 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
         InputError: If a valid point is not finite, or ``valid`` is not bool.
     """
     check_masks(valid=valid)
-    KORNIA_CHECK_SHAPE(points, ["B", "N", "3"])
-    KORNIA_CHECK_SHAPE(valid, [str(size) for size in points.shape[:2]])
+    check_shape("points", points, "B", "N", 3)
+    check_shape("valid", valid, *points.shape[:2])
     if not eps > 0 or min_samples < 1:  # also if eps is NaN
         raise ConfigError(
             f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"

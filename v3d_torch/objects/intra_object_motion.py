@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
-from v3d_torch.geometry.argument_checks import check_masks, check_not_negative
+from v3d_torch.geometry.argument_checks import check_masks, check_not_negative, check_shape
 from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.objects.chamfer import chamfer_distance
@@ -61,9 +60,13 @@ def intra_object_motion(
     """
     check_not_negative(distance_threshold=distance_threshold)
     check_masks(previous_valid=previous_valid, current_valid=current_valid)
+    check_shape("previous", previous, "B", "N", 3)
+    check_shape("current", current, previous.shape[0], "M", 3)
     dtype = previous.dtype
     previous, current = previous.to(working_dtype(dtype)), current.to(working_dtype(dtype))
     if T_current_previous is not None:
+        batch = () if T_current_previous.ndim == 2 else previous.shape[:1]
+        check_shape("T_current_previous", T_current_previous, *batch, 4, 4)
         previous = _transform(T_current_previous, previous, previous_valid)
     mean_square = chamfer_distance(previous, current, previous_valid, current_valid) / 2
     # torch.where evaluates both branches: the 1 keeps the gradient of the unused branch finite.
@@ -74,7 +77,6 @@ def intra_object_motion(
 
 def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
     """Transform the valid points by T, and set the padding to the origin, because NaN would reach the gradient of T."""
-    KORNIA_CHECK_SHAPE(T, ["4", "4"] if T.ndim == 2 else [str(points.shape[0]), "4", "4"])
     if valid is not None:
         points = torch.where(valid[..., None], points, 0)
     return transform_points(T, points)

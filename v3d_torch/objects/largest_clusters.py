@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.kernels.compiler import can_read
 
 
@@ -33,8 +32,8 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
     check_masks(valid=valid)
     if labels.dtype != torch.int64:
         raise InputError(f"labels has the type {labels.dtype}; give labels of type torch.int64")
-    KORNIA_CHECK_SHAPE(labels, ["B", "N"])
-    KORNIA_CHECK_SHAPE(valid, [str(size) for size in labels.shape])
+    check_shape("labels", labels, "B", "N")
+    check_shape("valid", valid, *labels.shape)
     if labels.numel() == 0:
         return torch.zeros_like(valid)
     clustered = valid & (labels >= 0)

@@ -9,12 +9,11 @@ from enum import IntEnum
 from typing import Any
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE
 from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.kernels.voxel_blocks import SIDE, UNKNOWN
@@ -111,7 +110,7 @@ class OccupancyMap:
         check_masks(static=static)
         if depth.numel() == 0:
             raise InputError(f"the depth image has shape {tuple(depth.shape)}; give an image with pixels")
-        KORNIA_CHECK_SHAPE(T_wc, ["4", "4"])
+        check_shape("T_wc", T_wc, 4, 4)
         config = self.config
         limit = _MAX_CAMERA_BLOCKS * SIDE * config.voxel_size
         if not bool(are_rigid(T_wc, _ROTATION_TOLERANCE)) or float(T_wc[:3, 3].abs().max()) > limit:
@@ -264,5 +263,5 @@ class OccupancyMap:
 
 def _rows(points: Tensor) -> Tensor:
     """Points (..., 3) as float64, (N, 3), without their graph."""
-    KORNIA_CHECK_SHAPE(points, ["*", "3"])
+    check_shape("points", points, "*", 3)
     return points.detach().to(torch.float64).reshape(-1, 3)

@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from v3d_torch.geometry.argument_checks import check_shape
 from v3d_torch.geometry.cell_keys import cell_keys, cells_of_keys
 from v3d_torch.kernels import ray_casting as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -65,10 +65,10 @@ def observe_voxels(
         max_depth: Depth beyond which nothing is observed, metres.
         tolerance: Depth error divided by the squared depth, 1/m.
     """
-    KORNIA_CHECK_SHAPE(depth, ["h", "w"])
-    KORNIA_CHECK_SHAPE(static, [str(side) for side in depth.shape])
-    KORNIA_CHECK_SHAPE(rays, [*(str(side) for side in depth.shape), "3"])
-    KORNIA_CHECK_SHAPE(T_wc, ["4", "4"])
+    check_shape("depth", depth, "h", "w")
+    check_shape("static", static, *depth.shape)
+    check_shape("rays", rays, *depth.shape, 3)
+    check_shape("T_wc", T_wc, 4, 4)
     valid = (depth > 0) & depth.isfinite()
     nearest = -max_pool2d(-torch.where(valid, depth, torch.inf)[None], 3, 1, 1)[0]
     nearest, z, hits = nearest[valid].to(torch.float64), depth[valid].to(torch.float64), static[valid]

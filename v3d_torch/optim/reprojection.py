@@ -17,11 +17,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from torch import Tensor
 
 from v3d_torch.config import TrackingConfig
-from v3d_torch.geometry.argument_checks import check_positive
+from v3d_torch.geometry.argument_checks import check_positive, check_shape
 from v3d_torch.kernels import whitening as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
@@ -87,10 +86,10 @@ def prepare_measurements(
         ConfigError: If a standard deviation that is a number is not positive.
     """
     check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
-    for sigma in (pixel_sigma, inverse_depth_sigma):
+    for name, sigma in (("pixel_sigma", pixel_sigma), ("inverse_depth_sigma", inverse_depth_sigma)):
         # The shape (M, 1) would broadcast to M problems of a batch, each with one standard deviation.
         if isinstance(sigma, Tensor) and sigma.numel() != 1:
-            KORNIA_CHECK_SHAPE(sigma, ["*", str(uv.shape[-2])])
+            check_shape(name, sigma, "*", uv.shape[-2])
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
     inverse_depth = fill_padding(inverse_depth, valid, 0.0)

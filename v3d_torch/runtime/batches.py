@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.core.check import KORNIA_CHECK_SHAPE
 from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_shape
 from v3d_torch.kernels.compiler import can_read, to_array
 
 
@@ -115,9 +115,10 @@ def check_shapes(**arguments: tuple[Tensor | float | None, *tuple[int | str | No
         InputError: If the batches do not broadcast.
     """
     sizes: dict[str, int] = {}
-    for value, *dimensions in arguments.values():
-        if isinstance(value, Tensor) and None not in dimensions:
-            KORNIA_CHECK_SHAPE(value, ["*", *(str(sizes.get(str(size), size)) for size in dimensions)])
+    for name, (value, *dimensions) in arguments.items():
+        known = [sizes.get(str(size), size) for size in dimensions if size is not None]
+        if isinstance(value, Tensor) and len(known) == len(dimensions):
+            check_shape(name, value, "*", *known)
             found = zip(dimensions, value.shape[value.ndim - len(dimensions) :], strict=True)
             sizes |= {letter: size for letter, size in found if isinstance(letter, str)}
     return common_batch(**{name: (value, len(dimensions)) for name, (value, *dimensions) in arguments.items()})
