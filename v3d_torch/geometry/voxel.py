@@ -42,7 +42,10 @@ def _voxel_pool_compiled(points: Tensor, valid: Tensor, size: float) -> Voxels:
         return NotImplemented
     mask, coordinates = valid.numpy(), to_array(points)
     limits = np.float32(size), float(_MAX_VOXELS)
-    pooled = [kernels.pool_voxels(cloud[present], *limits) for cloud, present in zip(coordinates, mask, strict=True)]
+    pooled = [
+        kernels.pool_voxels(cloud.compress(present, axis=0), *limits)
+        for cloud, present in zip(coordinates, mask, strict=True)
+    ]
     if any(len(index) > 0 and len(means) == 0 for means, _, index in pooled):
         return NotImplemented
     shape = len(pooled), max((len(means) for means, _, _ in pooled), default=0)

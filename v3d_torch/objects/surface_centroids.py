@@ -49,22 +49,28 @@ class SurfaceCentroids:
         Returns:
             Centroids, world frame, metres, float64, each of shape :math:`(3,)`; None for a mask without depth.
         """
-        stride = self._config.stride
-        depth, T_wd = np.ascontiguousarray(view.depth.numpy()[0, ::stride, ::stride]), invert(view.T_dw)
+        stride, T_wd = self._config.stride, invert(view.T_dw).numpy()
+        depth = np.ascontiguousarray(view.depth.numpy()[0, ::stride, ::stride])
         is_known = (depth > 0) & (depth <= self._config.max_depth)
         pixels = [np.flatnonzero(mask.numpy()[::stride, ::stride] & is_known) for mask in masks]
-        surfaces = [self._surface(each, depth.ravel()[each]) for each in pixels]
-        return [T_wd[:3, :3] @ _centroid(each) + T_wd[:3, 3] if len(each) else None for each in surfaces]
+        surfaces = [self._surface(each, depth.take(each)) for each in pixels]
+        return [
+            torch.from_numpy(T_wd[:3, :3] @ _mean_of_voxels(each) + T_wd[:3, 3]) if len(each) else None
+            for each in surfaces
+        ]
 
     def _surface(self, pixels: NDArray[np.intp], depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the points (P, 3) of the pixels (R,) whose depth (R,) is near their median depth."""
         # NumPy is faster here than torch: a frame has a few small surfaces.
-        near = np.abs(depth - np.median(depth)) < _MAX_DEPTH_OFFSET if len(depth) else slice(0)
-        return np.asarray(self._rays[pixels[near]] * depth[near, None])
+        if not len(depth):
+            return np.zeros((0, 3), np.float32)
+        middle = len(depth) // 2
+        near = np.abs(depth - np.partition(depth, middle)[middle]) < _MAX_DEPTH_OFFSET
+        return self._rays.take(pixels[near], axis=0) * depth[near][:, None]
 
 
-def _centroid(surface: NDArray[np.float32]) -> Tensor:
-    """Return the mean of the voxels of a surface, float64, shape (3,)."""
+def _mean_of_voxels(surface: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the mean of the voxels of a surface (P, 3), shape (3,)."""
     points = torch.from_numpy(surface)[None]
     voxels = voxel_pool(points, torch.ones(points.shape[:2], dtype=torch.bool), _VOXEL_SIZE)
-    return voxels.means[0].to(torch.float64).mean(dim=0)
+    return np.asarray(voxels.means[0].numpy().mean(axis=0, dtype=np.float64))
