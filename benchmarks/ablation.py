@@ -16,8 +16,9 @@ from tempfile import TemporaryDirectory
 from command import make_parser, publish
 from heading import make_heading
 from sequences import locate_sequence
-from storage import Measurement, Row
+from storage import Measurement, Row, file_of
 
+from v3d_torch.evaluation.ablation import VARIANTS
 from v3d_torch.evaluation.tables import format_median_and_range, markdown_row
 
 CELLS = {
@@ -50,19 +51,20 @@ def main() -> None:
     """Run the study and print its table."""
     parser = make_parser("Ablation study of the system, as Markdown.")
     parser.add_argument("--seqs", nargs="+", required=True, help="sequences with ground truth")
+    parser.add_argument("--variants", default=",".join(VARIANTS), help="variants, separated by commas [all]")
     parser.add_argument("--seeds", type=int, default=3, help="number of runs of each variant, with seeds from 0 [3]")
     options = parser.parse_args()
     heading = make_heading()
     sources = [word for name in options.seqs for word in ("--seq", locate_sequence(name, options.data_root))]
     with TemporaryDirectory() as out:
         # -P: the package imported here, whose commit is in the heading, not one in the working folder.
-        command = [sys.executable, "-P", "-m", "v3d_torch", "ablate", *sources, "--seeds", str(options.seeds)]
-        done = subprocess.run([*command, "--out", out], stdout=sys.stderr)  # noqa: S603
+        command = [sys.executable, "-P", "-m", "v3d_torch", "ablate", *sources, "--variants", options.variants]
+        done = subprocess.run([*command, "--seeds", str(options.seeds), "--out", out], stdout=sys.stderr)  # noqa: S603
         if not (Path(out) / "ablation.csv").is_file():
             parser.exit(done.returncode)
         with (Path(out) / "ablation.csv").open(newline="", encoding="utf-8") as file:
             rows = list(summarise(list(csv.DictReader(file))))
-    publish([*heading.lines(), "", *table(rows)], options, parser, {"ablation": Measurement(heading, rows)})
+    publish([*heading.lines(), "", *table(rows)], options, parser, {file_of("ablation"): Measurement(heading, rows)})
 
 
 if __name__ == "__main__":

@@ -278,6 +278,12 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
             objects_table,
             remarks=no_remarks,
         ),
+        Part(
+            "ablation_float32",
+            "The same on a processor without 8-bit vector instructions, where the network runs in 32 bits.",
+            objects_table,
+            remarks=no_remarks,
+        ),
     ),
     "Tracks of people": (
         Part(
@@ -357,6 +363,11 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 "ATE RMSE in metres without each part of the system, lower is better. Many differences are smaller"
                 " than the range over the seeds. [ablate](commands/ablate.md) describes the variants."
             ),
+            pivot_table("variant", "ate", VARIANTS),
+        ),
+        Part(
+            "ablation_float32",
+            "The same on a processor without 8-bit vector instructions, where the network runs in 32 bits.",
             pivot_table("variant", "ate", VARIANTS),
         ),
     ),

@@ -21,6 +21,7 @@ RESULTS = Path(__file__).with_name("results")
 
 KEYS: Mapping[str, tuple[str, ...]] = {
     "ablation": ("sequence", "variant"),
+    "ablation_float32": ("sequence", "variant"),
     "accuracy": ("sequence", "system"),
     "calibration": ("sequence", "change", "parameter"),
     "consistency": ("sequence", "configuration"),

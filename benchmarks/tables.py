@@ -37,6 +37,7 @@ COMMANDS = {
 VARIANTS = {
     "baseline": "no masks",
     "no_voting": "no votes",
+    "no_free_space": "no free-space check",
     "no_chamfer": "no Chamfer distance",
     "no_prediction": "no prediction of missed objects",
     "no_appearance": "no colours in the assignment of ids",

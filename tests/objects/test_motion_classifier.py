@@ -761,11 +761,16 @@ def test_missed_walker_is_visible_although_the_mask_of_another_one_covers_it(mas
     assert float((~last.result.static_mask)[last.owner == 3].double().mean()) > 0.95
 
 
-def test_disabled_voting_and_chamfer_give_no_motion() -> None:
-    things = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0)))
-    no_voting = simulate(*things, seconds=0.5, overrides=("objects.voting.enabled=false",))
-    assert MotionState.DYNAMIC not in motion_states(no_voting, 4)
-    assert {frame[4].votes for frame in no_voting} == {0}
+def test_without_votes_free_space_alone_shows_motion_and_without_both_there_is_none() -> None:
+    things, no_voting = (*CHAIRS, walker((-0.5, 0.1, 2.3), (0.9, 0.0, 0.0))), "objects.voting.enabled=false"
+    with_free_space = simulate(*things, seconds=0.5, overrides=(no_voting,))
+    without = simulate(*things, seconds=0.5, overrides=(no_voting, "objects.free_space.enabled=false"))
+    assert {frame[4].votes for frame in (*with_free_space, *without)} == {0}
+    assert MotionState.DYNAMIC in motion_states(with_free_space, 4)
+    assert MotionState.DYNAMIC not in motion_states(without, 4)
+
+
+def test_disabled_chamfer_gives_no_deformation() -> None:
     no_chamfer = simulate(
         *CHAIRS, swaying_person((0.0, 0.1, 2.4)), seconds=0.8, overrides=("objects.chamfer.enabled=false",)
     )

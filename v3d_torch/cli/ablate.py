@@ -26,9 +26,10 @@ def main(
         ),
     ],
     data_root: DataRoot = None,
-    variants: Annotated[
-        str, typer.Option(help="Variants to run, separated by commas.")
-    ] = "baseline,no_voting,no_chamfer,no_prediction,no_appearance,no_unlabelled,not_upright,global_shutter,paper,full",
+    variants: Annotated[str, typer.Option(help="Variants to run, separated by commas.")] = (
+        "baseline,no_voting,no_free_space,no_chamfer,no_prediction,no_appearance,no_unlabelled,not_upright,"
+        "global_shutter,paper,full"
+    ),
     seeds: Annotated[int, typer.Option(min=1, help="Number of runs of each variant, with seeds from 0.")] = 3,
     set_: Annotated[
         list[str] | None,

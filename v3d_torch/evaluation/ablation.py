@@ -22,6 +22,7 @@ from v3d_torch.evaluation.tables import Cell, ErrorTable, format_markdown_table,
 VARIANTS = (
     "baseline",
     "no_voting",
+    "no_free_space",
     "no_chamfer",
     "no_prediction",
     "no_appearance",

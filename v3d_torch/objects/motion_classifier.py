@@ -103,18 +103,20 @@ class MotionClassifier(StatefulComponent):
         time_spans = (*config.voting.time_spans, config.chamfer.time_span)
         pairs = detection_pairs(detected, time_spans, self.tracker.comparable_since)
 
-        # Independent evidence, not in the paper: free space.
+        # Independent evidence, not in the paper: free space. An object of which most appeared needs no votes: a new one
+        # has no earlier distance to compare, and of a known one this shows the motion directly.
         free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
+        appeared = {track for track in detected if free_space.has_appeared(track)}
 
         # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
-        vote = hough_vote_evidence(detected, pairs, free_space, self._last_stamp, config.voting)
+        vote = hough_vote_evidence(pairs, free_space, self._last_stamp, config.voting)
         # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
         # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
         shifted = self._shifted_tracks(tracks, feature_support, on_objects, view)
         # The camera motion is measured relative to the object with most features, such as a table that fills the image.
         with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
-        for track in (vote.dynamic | shifted) - with_most_inliers:
+        for track in (appeared | vote.dynamic | shifted) - with_most_inliers:
             track.mark_dynamic(stamp)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.

@@ -1,11 +1,11 @@
-"""Evidence of object motion in one frame: free space, Hough votes and Chamfer distances (paper, Sec. III-C, III-D).
+"""Evidence of object motion in one frame: Hough votes and Chamfer distances (paper, Sec. III-C, III-D), and free space.
 
 All functions return their results. `MotionClassifier` updates the tracks with them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -125,7 +125,7 @@ class VoteEvidence:
 
     Attributes:
         votes: Maximum number of votes of each compared object over the time spans.
-        dynamic: Objects that are voted dynamic over some time span, or that appeared.
+        dynamic: Objects that are voted dynamic over some time span.
         vote_pairs: Votes that counted over some time span: id of the voting object and id of the object voted for,
             sorted.
     """
@@ -136,7 +136,6 @@ class VoteEvidence:
 
 
 def hough_vote_evidence(
-    detected: Collection[Track],
     pairs: dict[float, DetectionPairs],
     free_space: FreeSpaceEvidence,
     previous_stamp: float,
@@ -145,7 +144,6 @@ def hough_vote_evidence(
     """Vote over all time spans (paper, Alg. 1).
 
     Args:
-        detected: Tracks that are detected in the frame.
         pairs: Pairs of detections for each time span.
         free_space: Result of the free-space check.
         previous_stamp: Timestamp of the previous frame, seconds.
@@ -157,10 +155,8 @@ def hough_vote_evidence(
     if not config.enabled:
         return VoteEvidence({}, set(), [])
     max_votes: dict[Track, int] = {}
+    dynamic: set[Track] = set()
     vote_pairs: set[tuple[int, int]] = set()
-    # An object of which most appeared in free space needs no votes: a new one has no earlier distance to compare, and
-    # of a known one this shows the motion directly.
-    dynamic = {track for track in detected if free_space.has_appeared(track)}
     for time_span in config.time_spans:
         compared = pairs[time_span]
         if time_span == 0:  # only objects of the previous frame are compared (Alg. 1)
