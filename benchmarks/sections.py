@@ -88,9 +88,10 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 " configuration, `realtime` is `--config realtime`, which segments every second frame, and `baseline`"
                 " is `--segmenter none`. ORB-SLAM3 (PyPI) is pyorbslam3 with a vocabulary trained on the sequences;"
                 " it is not deterministic. A system that skips hard frames has a lower error, so coverage is given if"
-                " it is below 100%. Parameters of v3d_torch were chosen on these sequences, those of the other"
-                " systems are their defaults. Results on the same sequences played backwards, mirrored, or with"
-                " changed images are below ([design choices](#sequences-on-which-no-parameter-was-chosen))."
+                " it is below 100%. Parameters of v3d_torch were chosen on these sequences; the other systems have"
+                " their default parameters, but not their vocabularies (below). Results on the same sequences played"
+                " backwards, mirrored, or with changed images are below"
+                " ([design choices](#sequences-on-which-no-parameter-was-chosen))."
             ),
             accuracy_table,
             key="system",

@@ -49,8 +49,9 @@ def main_tables(folder: Path = RESULTS) -> str:
         " configuration, `realtime` is `--config realtime`, `baseline` is `--segmenter none`. Composed sequences are"
         " real images of people in real rooms. ORB-SLAM3 (PyPI) is pyorbslam3; ORB-SLAM2, ORB-SLAM3 and NGD-SLAM, which"
         " masks people, were built from source. Parameters of v3d_torch were chosen on these sequences; the other"
-        " systems have their defaults. The true poses of walkers_room and walkers_crowd are accurate to about 0.03"
-        " m: smaller differences mean little there.",
+        " systems have their default parameters, and vocabularies trained on these sequences (pyorbslam3) or on"
+        " photographs. The true poses of walkers_room and walkers_crowd are accurate to about 0.03 m: smaller"
+        " differences mean little there.",
         "",
         *accuracy_table(accuracy),
         "",

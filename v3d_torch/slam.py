@@ -78,9 +78,9 @@ class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     `preprocess` runs the stages that can run ahead of tracking, see `FramePreprocessor`; `track` runs the others. Every
-    stage is an attribute and can be replaced by an object with the same methods, whose results are checked. Only
-    `estimate_motion`, `track_map` and `loop_closer` cannot be replaced alone, because other stages call them. Hooks get
-    the arguments and results of stages, see `register_stage_hook`.
+    stage is an attribute and can be replaced by an object with the same methods; results of replaced stages that other
+    stages use are checked. Only `estimate_motion`, `track_map` and `loop_closer` cannot be replaced alone, because
+    other stages call them. Hooks get the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -294,7 +294,7 @@ class V3DSLAM(FramePreprocessor):
         if not self._has_objects:
             self._wait_for_segmentation(preprocessed)
             return FrameObjects.none(*depth.shape[-2:]), None
-        with self.timer("free_space"):  # III-C: surfaces that contradict a static scene
+        with self.timer("free_space"):  # not in the paper: surfaces that contradict a static scene
             was_lost = self.poses.status is TrackingStatus.LOST
             T_dw = T_dc @ self._compose_pose(motion)
             view = self.free_space_check.make_view(frame.stamp, depth, T_dw, is_motion_measured=motion.is_measured)

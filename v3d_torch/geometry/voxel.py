@@ -95,6 +95,16 @@ def voxel_pool(points: Tensor, valid: Tensor, size: float) -> Voxels:
     return Voxels(means.to(result_dtype(points.dtype)), counts > 0, counts, voxel_index)
 
 
+def pool_cloud(points: Tensor, size: float) -> Voxels:
+    """Pool one cloud without padding in single precision, for which there is a kernel; a batch of one.
+
+    Args:
+        points: Points, metres, shape :math:`(N, 3)`; their rounding is far smaller than a voxel.
+        size: Side of a voxel, metres.
+    """
+    return voxel_pool(points[None].to(torch.float32), torch.ones(1, len(points), dtype=torch.bool), size)
+
+
 def _number_voxels(points: Tensor, valid: Tensor, size: float) -> tuple[Tensor, Tensor]:
     """Number the occupied voxels of each cloud.
 

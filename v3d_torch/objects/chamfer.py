@@ -14,6 +14,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels.compiler import can_read
+from v3d_torch.runtime.batches import mask_or_all
 
 _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 """FLANN_INDEX_KDTREE_SINGLE, an exact KD-tree for few dimensions; faster here than the one of SciPy."""
@@ -59,7 +60,7 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
     for name, valid, cloud in (("p_valid", p_valid, p), ("q_valid", q_valid, q)):
         if valid is not None:
             check_shape(name, valid, *cloud.shape[:2])
-    p_valid, q_valid = _mask(p, p_valid), _mask(q, q_valid)
+    p_valid, q_valid = mask_or_all(p_valid, p[..., 0]), mask_or_all(q_valid, q[..., 0])
     dtype = p.dtype
     # Padding is set to the origin: NaN would reach the gradients.
     p, q = (
@@ -75,11 +76,6 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
         _mean_square(q, p, nearest_p, q_valid, p_valid),
     ]
     return (means[0] + means[1]).to(result_dtype(dtype))
-
-
-def _mask(points: Tensor, valid: Tensor | None) -> Tensor:
-    """Mask of the points that are not padding, (B, N)."""
-    return torch.ones_like(points[..., 0], dtype=torch.bool) if valid is None else valid
 
 
 def _mean_square(points: Tensor, others: Tensor, nearest: Tensor, valid: Tensor, others_valid: Tensor) -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -17,18 +16,6 @@ from v3d_torch.kernels.compiler import compiled_by, to_array
 
 _POSE_ERROR = 0.01
 """Reprojection error of a view's pose, as a fraction of the image width: 0.6 degrees of a Kinect's field of view."""
-
-
-class SpaceView(Protocol):
-    """Pose and nearest depth of a view: `DepthView` or `StoredView`."""
-
-    @property
-    def T_dw(self) -> Tensor:
-        """World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`."""
-
-    @property
-    def nearest_depth(self) -> Tensor:
-        """Minimum depth around each pixel, metres, float32, shape :math:`(H, W)`; 0 for a pixel without depth."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +67,10 @@ class DepthView:
         a pose that is off by some pixels, would make static points appear or vacate.
         """
         return _nearest_depth(self.depth[0], round(_POSE_ERROR * self.depth.shape[2]) + self.misalignment)
+
+
+SpaceView = DepthView | StoredView
+"""View with which the free-space check compares points: of the current frame, or an earlier one."""
 
 
 def erode_measured(depth: NDArray[np.float32], size: int) -> NDArray[np.float32]:

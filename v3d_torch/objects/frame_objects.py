@@ -81,7 +81,8 @@ class FrameObjects:
         objects: Objects, sorted by id.
         static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
         static_without_people: Pixels of ``static_mask`` at a larger distance from moving objects and from people, even
-            static ones, for the coloured map; bool, shape :math:`(H, W)`.
+            static ones: for what is stored, such as point map, recordings and static surfaces; bool, shape
+            :math:`(H, W)`.
         vote_pairs: Votes that counted over any time span: id of the voting object and id of the object voted for,
             sorted.
     """

@@ -15,7 +15,7 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.objects.assignment import match_instances
 from v3d_torch.objects.image_scale import coarse_stride
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
+from v3d_torch.objects.mask_propagation import predict_mask
 from v3d_torch.objects.track import Track
 from v3d_torch.objects.track_matching import (
     DetectedInstances,
@@ -287,7 +287,7 @@ class InstanceTracker(torch.nn.Module):
                 track.drop_masks()
                 resting.append(track)
                 continue
-            seen_through = predicted.silhouettes[i].count_seen_through(depth, DEPTH_TOLERANCE)
+            seen_through = predicted.silhouettes[i].count_seen_through(depth)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
                 track.add_vacancy(stamp, min(stamp - self._last_stamp, _MAX_OBSERVED_TIME))
             if stamp - track.newest.stamp > self._config.max_missed_time or is_covered:

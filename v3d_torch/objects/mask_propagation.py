@@ -18,13 +18,10 @@ from torch import Tensor
 from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.silhouette import Silhouette, silhouettes
+from v3d_torch.objects.silhouette import DEPTH_TOLERANCE, Silhouette, silhouettes
 from v3d_torch.objects.track import Track, predict_clouds
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
-
-DEPTH_TOLERANCE = 0.2
-"""Tolerance of the depth around the predicted points, metres: arms and legs swing by this much between two frames."""
 
 
 def propagate_instances(

@@ -24,6 +24,9 @@ CELL_SIZE = 4
 """Side of the cells that collect the depths of a cloud, pixels: smaller than a cell of the network's masks, 6 pixels
 by default."""
 
+DEPTH_TOLERANCE = 0.2
+"""Tolerance of the depth around predicted points, metres: arms and legs swing by this much between two frames."""
+
 _NO_DEPTH = 1e6
 """Depth of cells without points, metres: farther than any measurement."""
 
@@ -207,28 +210,26 @@ class Silhouette:
         padded = cv2.copyMakeBorder(self._minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
         return np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
 
-    def visible_fraction(self, depth: Tensor, tolerance: float) -> float:
+    def visible_fraction(self, depth: Tensor) -> float:
         """Return the fraction of projected points whose depth is the measured depth.
 
         Args:
             depth: Measured depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            tolerance: Tolerance of the depth in front of and behind a point, metres.
 
         Returns:
             Fraction of the points, from 0 to 1; 0 if no point is in the image.
         """
         if len(self._z) == 0:
             return 0.0
-        return float((np.abs(self._measured_depth(depth) - self._z) < tolerance).mean())
+        return float((np.abs(self._measured_depth(depth) - self._z) < DEPTH_TOLERANCE).mean())
 
-    def count_seen_through(self, depth: Tensor, tolerance: float) -> int:
+    def count_seen_through(self, depth: Tensor) -> int:
         """Count the projected points behind which a surface is measured, so that their place is empty.
 
         Args:
             depth: Measured depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
-            tolerance: Minimum distance of the surface from the point, metres.
         """
-        return 0 if len(self._z) == 0 else int((self._measured_depth(depth) - self._z > tolerance).sum())
+        return 0 if len(self._z) == 0 else int((self._measured_depth(depth) - self._z > DEPTH_TOLERANCE).sum())
 
     def _measured_depth(self, depth: Tensor) -> NDArray[np.float32]:
         """Return the measured depth at each projected point, metres, shape (P,)."""

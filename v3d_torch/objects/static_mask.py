@@ -30,7 +30,7 @@ class StaticMasks(NamedTuple):
 def static_masks(
     excluded: Sequence[RefinedMask], all_masks: Sequence[RefinedMask], size: torch.Size, config: StaticMaskConfig
 ) -> StaticMasks:
-    """Compute the static mask of a frame, with and without people.
+    """Compute the pixels that tracking can use, and those of them that can be stored in maps.
 
     Args:
         excluded: Masks of the objects that tracking must not use.
@@ -49,5 +49,4 @@ def _outside(masks: Sequence[RefinedMask], size: torch.Size, dilation: int) -> T
     covered = np.zeros(size, np.bool_)
     for each in masks:
         covered[each.crop] |= each.mask
-    outside = dilate(torch.from_numpy(covered), dilation).numpy()
-    return torch.from_numpy(np.logical_not(outside, out=outside))
+    return ~dilate(torch.from_numpy(covered), dilation)

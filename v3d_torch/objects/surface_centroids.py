@@ -12,7 +12,7 @@ from torch import Tensor
 from v3d_torch.config import CloudConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
-from v3d_torch.geometry.voxel import voxel_pool
+from v3d_torch.geometry.voxel import pool_cloud
 from v3d_torch.objects.depth_view import DepthView
 
 _VOXEL_SIZE = 0.05
@@ -71,6 +71,5 @@ class SurfaceCentroids:
 
 def _mean_of_voxels(surface: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return the mean of the voxels of a surface (P, 3), shape (3,)."""
-    points = torch.from_numpy(surface)[None]
-    voxels = voxel_pool(points, torch.ones(points.shape[:2], dtype=torch.bool), _VOXEL_SIZE)
+    voxels = pool_cloud(torch.from_numpy(surface), _VOXEL_SIZE)
     return np.asarray(voxels.means[0].numpy().mean(axis=0, dtype=np.float64))

@@ -19,7 +19,7 @@ from v3d_torch.objects.association import (
     position_log_ratio,
 )
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.mask_propagation import DEPTH_TOLERANCE, predict_mask
+from v3d_torch.objects.mask_propagation import predict_mask
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.resampling import subsample
 from v3d_torch.objects.silhouette import Silhouette, silhouettes
@@ -143,7 +143,7 @@ def predict_tracks(
         tuple(tracks),
         projected,
         pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
-        torch.tensor([each.visible_fraction(depth, DEPTH_TOLERANCE) for each in projected], dtype=torch.float64),
+        torch.tensor([each.visible_fraction(depth) for each in projected], dtype=torch.float64),
     )
 
 

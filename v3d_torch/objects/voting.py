@@ -1,4 +1,4 @@
-"""Hough voting with spatial reasoning: detection of moving objects without camera pose (paper, Sec. III-C, Alg. 1)."""
+"""Hough voting (paper, Sec. III-C, Alg. 1), and the rule of the system, which combines it with the free-space check."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.frustum import are_in_frustum
 from v3d_torch.geometry.se3 import transform_points
-from v3d_torch.geometry.voxel import voxel_pool
+from v3d_torch.geometry.voxel import pool_cloud
 from v3d_torch.objects.depth_view import SpaceView
 
 _BLOCK_SIZE = 0.5
@@ -27,8 +27,7 @@ class PointBlocks:
     """
 
     def __init__(self, points: Tensor) -> None:
-        single = points[None].to(torch.float32)
-        pooled = voxel_pool(single, torch.ones(single.shape[:2], dtype=torch.bool), _BLOCK_SIZE)
+        pooled = pool_cloud(points, _BLOCK_SIZE)
         block, self._counts = pooled.voxel_index[0], pooled.counts[0]
         self._order = block.argsort(stable=True)
         self._ends = self._counts.cumsum(0)

@@ -13,7 +13,7 @@ from v3d_torch.geometry.camera import back_project
 from v3d_torch.geometry.depth_smoother import smooth_depth
 from v3d_torch.geometry.normals import surface_normals
 from v3d_torch.geometry.se3 import transform_points
-from v3d_torch.geometry.voxel import Voxels, voxel_pool
+from v3d_torch.geometry.voxel import pool_cloud
 from v3d_torch.mapping.static_views import StaticView, StaticViews
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.free_space_check import observe_free_space
@@ -92,17 +92,12 @@ def _fuse_batch(sums: Tensor, counts: Tensor, batch: list[Tensor], size: float) 
     """Sums and numbers of points per voxel, after a batch of points is added."""
     sums = torch.cat([sums, *batch])
     counts = torch.cat([counts, torch.ones(len(sums) - len(counts), dtype=counts.dtype)])
-    voxels = _pool(sums[:, :3] / counts[:, None], size)
+    voxels = pool_cloud(sums[:, :3] / counts[:, None], size)
     occupied = voxels.counts.shape[1]
     return (
         sums.new_zeros(occupied, 9).index_add_(0, voxels.voxel_index[0], sums),
         counts.new_zeros(occupied).index_add_(0, voxels.voxel_index[0], counts),
     )
-
-
-def _pool(points: Tensor, size: float) -> Voxels:
-    """Pool one cloud in single precision, for which there is a kernel; a voxel is far larger than its rounding."""
-    return voxel_pool(points[None].to(torch.float32), torch.ones(1, len(points), dtype=torch.bool), size)
 
 
 def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfig) -> Tensor:
@@ -119,7 +114,7 @@ def _is_observed_free(points: Tensor, views: StaticViews, config: FreeSpaceConfi
     Returns:
         Bool, shape :math:`(P,)`.
     """
-    cells = _pool(points, config.min_tolerance / 2)
+    cells = pool_cloud(points, config.min_tolerance / 2)
     centres = cells.means[0].to(torch.float64)
     free, occupied, free_since = torch.zeros(3, len(centres), dtype=torch.int32)  # since the last observed surface
     blocks = PointBlocks(centres)
