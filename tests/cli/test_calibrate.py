@@ -90,6 +90,12 @@ def test_estimated_depth_scale_and_damaged_ground_truth_are_reported(sequence: P
     assert not (tmp_path / "new.yaml").exists()
 
 
+@pytest.mark.parametrize("segmenter", ["nonne", "masks"])
+def test_unknown_segmenter_is_an_error(sequence: Path, tmp_path: Path, segmenter: str) -> None:
+    done = call("--seq", sequence, "--segmenter", segmenter, "--out", tmp_path / "new.yaml")
+    assert_error_line(done, f"error: --segmenter {segmenter}: is neither yolo nor none")
+
+
 def test_configuration_without_map_is_an_error(sequence: Path, tmp_path: Path) -> None:
     options = "--seq", sequence, "--segmenter", "none", "--out", tmp_path / "new.yaml"
     assert_error_line(call(*options, "--set", "mapping.enabled=false"), "mapping.enabled=false: there is no map")

@@ -310,7 +310,7 @@ def test_ground_truth_from_other_file_is_used(copy: Path, tmp_path: Path) -> Non
 def test_missing_results_and_unusable_ground_truth_are_one_line_each(copy: Path, tmp_path: Path) -> None:
     write_text(tmp_path / "late.txt", "9000.0 0 0 0 0 0 0 1\n9000.1 0 0 0 0 0 0 1\n")
     for arguments, words in (
-        ([tmp_path / "nowhere"], "nowhere: has no results of a run"),
+        ([tmp_path / "nowhere"], "nowhere: is not a folder"),
         ([tmp_path / (300 * "x")], "cannot be used (File name too long); check path and permissions"),
         ([copy, "--groundtruth", tmp_path / "late.txt"], "late.txt: only 0 of 14 poses"),
     ):

@@ -230,6 +230,7 @@ def test_error_of_a_folder_that_becomes_locked_names_no_way_to_resume(
     (out / RunFile.LOG).touch()
     (out / RunFile.CHECKPOINT).touch()
     monkeypatch.setattr(run_command, "check_unlocked", lambda folder: None)
+    monkeypatch.setattr(run_command, "_check_contents", lambda *_, **__: False)  # the folder was empty then
     with lock_results(out):
         done = call(*run_arguments(sequence, out))
     assert_error_line(done, f"{out}: another run or batch is writing to this folder")
@@ -389,6 +390,14 @@ def test_bag_of_a_resumed_run_has_the_remaining_frames_and_its_own_odom(out: Pat
     assert len(messages["/odom"]) == FRAMES - 5 and len(messages["/path"][-1][1].poses) == FRAMES
     first = messages["/odom"][0][1].pose.pose.position
     assert (first.x, first.y, first.z) == pytest.approx((0, 0, 0), abs=1e-9)
+
+
+def test_new_run_does_not_replace_an_interrupted_one(sequence: Path, out: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    done = call("--seq", sequence, "--out", out)
+    message = f"has an interrupted run; continue it with --resume {out}, choose another folder with --out, or delete"
+    assert_error_line(done, f"{out}: {message} this one")
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
 
 
 def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:

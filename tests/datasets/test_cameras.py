@@ -49,14 +49,14 @@ def test_camera_file_is_read(tmp_path: Path, name: str, text: str) -> None:
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("c.yaml", CAMERA_YAML.replace("fx: 30.0\n", ""), "fx: field required"),
+        ("c.yaml", CAMERA_YAML.replace("fx: 30.0\n", ""), "fx is missing; add it to the camera"),
         ("c.yaml", CAMERA_YAML.replace("30.0", "wide"), "fx: .*got 'wide'"),
         ("c.yaml", CAMERA_YAML.replace("30.0", "-30"), "fx: .*greater than or equal to 1.*got -30"),
         ("c.yaml", CAMERA_YAML.replace("30.0", "true"), "fx: input should be a number, got True; correct the camera"),
         ("c.yaml", CAMERA_YAML + "distortion: [0, 0, no, 0, 0]\n", "distortion: input should be a number, got .*False"),
         ("c.yaml", CAMERA_YAML.replace("15.5", ".nan"), "cx: .*finite.*got nan"),
         ("c.yaml", CAMERA_YAML + "distortion: [1, 2]\n", "distortion has 2 numbers; write k1, k2, p1, p2, k3"),
-        ("c.yaml", CAMERA_YAML + "focal: 3\n", "focal: extra"),
+        ("c.yaml", CAMERA_YAML + "focal: 3\n", "unknown key focal; remove it"),
         ("c.yaml", CAMERA_YAML + "1: 3\n", "c.yaml: "),
         ("c.yaml", "{fx", "not valid YAML"),
         ("c.yaml", "!!python/object/apply:os.getcwd []", "not valid YAML"),

@@ -141,7 +141,7 @@ def test_numbers_in_names_are_compared_as_numbers(tmp_path: Path) -> None:
 def test_folder_is_accepted_as_a_string(tmp_path: Path) -> None:
     Image.fromarray(ids(np.uint8, 3)).save(tmp_path / "a.png")
     assert MaskFolder(str(tmp_path)).read(frame(0, 0.0))[1].tolist() == [3]
-    with pytest.raises(InputError, match="gone: contains no PNG files"):
+    with pytest.raises(InputError, match="gone: does not exist; name the folder"):
         MaskFolder(str(tmp_path / "gone"))
 
 

@@ -53,7 +53,7 @@ def main(
     with quick_imports():
         from v3d_torch.config.loading import load_config
         from v3d_torch.datasets import SourceOptions, load_sequence
-        from v3d_torch.errors import OutputError
+        from v3d_torch.errors import ConfigError, OutputError
         from v3d_torch.io.files import check_writable, write_text
         from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
         from v3d_torch.runs.interrupts import interrupts_between_frames
@@ -71,6 +71,8 @@ def main(
         return load_sequence(seq, data_root=data_root, camera=camera, options=options)
 
     with exit_on_error():
+        if segmenter not in (None, "yolo", "none"):
+            raise ConfigError(f"--segmenter {segmenter}: is neither yolo nor none")
         if os.path.lexists(out):  # also a link that leads nowhere, which the file would replace
             raise OutputError(f"{out}: already exists; choose another file with --out")
         check_writable(out)

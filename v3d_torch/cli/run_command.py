@@ -179,7 +179,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     masks = _path(request.masks)
     if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
         check_unlocked(out)
-        _check_contents(out, masks, is_resumed=checkpoint is not None)
+        if _check_contents(out, masks, is_resumed=checkpoint is not None):
+            print_line(console, f"note: {out}: the results of an earlier run are replaced")
     sequence = _open_sequence(request, console)
     print_notes(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
@@ -246,8 +247,11 @@ def _check_map_path(path: Path, out: Path | None, display: Display) -> None:
     check_writable(path)
 
 
-def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> None:
-    """Check that a run would overwrite neither the masks that it reads nor files of the user.
+def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> bool:
+    """Check that a run would overwrite neither the masks that it reads, files of the user, nor an interrupted run.
+
+    Returns:
+        True if a new run replaces the results of an earlier one.
 
     Raises:
         OutputError: If it would, or if a new run would mix its results with those of a batch or an ablation study.
@@ -255,14 +259,21 @@ def _check_contents(folder: Path, masks: Path | None, *, is_resumed: bool) -> No
     written = [os.path.realpath(folder / name) for name in (MASKS, MAP_MASKS)]  # also of a loop of links
     if masks is not None and os.path.realpath(masks) in written:
         raise OutputError(f"{masks}: would be written while it is read; choose another folder with --out")
-    if not is_resumed:
-        if (contents := describe_contents(folder)) is not None:
-            raise OutputError(f"{folder}: contains {contents}; choose another folder with --out")
-        resolved = Path(os.path.realpath(folder))
-        above = resolved.parents[2:3] if resolved.match("seed*") else ()  # <batch>/<sequence>/<configuration>/seed<k>
-        for contents in filter(None, map(describe_contents, above)):  # its tables would have the values of another run
-            raise OutputError(f"{folder}: is the folder of a run of {contents}; choose another folder with --out")
-        find_earlier_results(folder)
+    if is_resumed:
+        return False
+    if (contents := describe_contents(folder)) is not None:
+        raise OutputError(f"{folder}: contains {contents}; choose another folder with --out")
+    resolved = Path(os.path.realpath(folder))
+    above = resolved.parents[2:3] if resolved.match("seed*") else ()  # <batch>/<sequence>/<configuration>/seed<k>
+    for contents in filter(None, map(describe_contents, above)):  # its tables would have the values of another run
+        raise OutputError(f"{folder}: is the folder of a run of {contents}; choose another folder with --out")
+    earlier = find_earlier_results(folder)
+    if folder / RunFile.CHECKPOINT in earlier:
+        raise OutputError(
+            f"{folder}: has an interrupted run; continue it with --resume {shlex.quote(str(folder))}, choose another"
+            " folder with --out, or delete this one"
+        )
+    return bool(earlier)
 
 
 def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Annotated, Any
 
 import torch
@@ -60,6 +61,17 @@ class _CameraFile(BaseModel):
     inverse_depth_offset: Annotated[float, Field(ge=-MAX_INVERSE_DEPTH_OFFSET, le=MAX_INVERSE_DEPTH_OFFSET)] = 0.0
 
 
+def _describe(error: ValidationError) -> str:
+    """Describe what is wrong with the fields of a camera, and how to correct it; first a key that can be a slip."""
+    errors = {each["type"]: str(each["loc"][0]) for each in reversed(error.errors()) if each["loc"]}
+    if (unknown := errors.get("extra_forbidden")) is not None:
+        near = get_close_matches(unknown.lower(), _CameraFile.model_fields, n=1)
+        return f"unknown key {unknown}; {f'did you mean {near[0]}?' if near else 'remove it'}"
+    if (missing := errors.get("missing")) is not None:
+        return f"{missing} is missing; add it to the camera"
+    return f"{first_error(error)}; correct the camera"
+
+
 def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
     """Create a camera from unchecked fields.
 
@@ -79,7 +91,7 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
     try:
         checked = _CameraFile.model_validate(dict(fields)).model_dump()
     except ValidationError as error:
-        raise InputError(f"{source}: {first_error(error)}; correct the camera") from error
+        raise InputError(f"{source}: {_describe(error)}") from error
     model, distortion = checked["distortion_model"], checked["distortion"]
     if model is None and 0 < len(distortion) < 5:
         raise InputError(

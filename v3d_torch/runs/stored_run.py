@@ -63,8 +63,9 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
             common with the trajectory.
     """
     if not (folder / RunFile.METRICS).is_file():
+        problem = f"has no results of a run ({RunFile.METRICS} is missing)" if folder.is_dir() else "is not a folder"
         raise InputError(
-            f"{folder}: has no results of a run ({RunFile.METRICS} is missing);"
+            f"{folder}: {problem};"
             f" {suggest_folder(folder, RunFile.METRICS) or 'pass the folder that the run printed at its end'}"
         )
     config_path = folder / RunFile.CONFIG

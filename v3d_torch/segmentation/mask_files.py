@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -63,7 +64,8 @@ class MaskFolder:
         with suppress(OSError):  # for example a name that is too long
             self._paths = [path for path in list_images(folder) if path.suffix.lower() == ".png"]
         if not self._paths:
-            raise InputError(f"{folder}: contains no PNG files; name the folder of the id images with --masks")
+            problem = "contains no PNG files" if os.path.lexists(folder) else "does not exist"
+            raise InputError(f"{folder}: {problem}; name the folder of the id images with --masks")
         names = "labels.yaml", "labels.yml"
         self.labels_path = next((path for name in names if (path := folder / name).is_file()), folder / names[0])
         self.labels = _read_labels(self.labels_path) if self.labels_path.is_file() else None

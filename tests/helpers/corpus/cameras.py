@@ -78,10 +78,12 @@ CASES = [
     Case(
         "missing field",
         edit(YAML, replace_text("fy:", "#fy:")),
-        Fails(
-            "{seq}/camera.yaml: fy: field required, got {'cx': 63.5, 'cy': 47.5, 'depth_scale': 5000, 'fx':"
-            " 64.0, ...}; correct the camera"
-        ),
+        Fails("{seq}/camera.yaml: fy is missing; add it to the camera"),
+    ),
+    Case(
+        "misspelt field",
+        edit(YAML, replace_text("fy:", "fY:")),
+        Fails("{seq}/camera.yaml: unknown key fY; did you mean fy?"),
     ),
     Case(
         "duplicate field",
@@ -91,7 +93,7 @@ CASES = [
     Case(
         "unknown field",
         edit(YAML, lambda content: content + b"focal: 525\n"),
-        Fails("{seq}/camera.yaml: focal: extra inputs are not permitted, got 525; correct the camera"),
+        Fails("{seq}/camera.yaml: unknown key focal; remove it"),
     ),
     Case(
         "word instead of a number",

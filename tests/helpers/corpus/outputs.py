@@ -146,7 +146,11 @@ CASES = [
         Fails("{out}/masks: would be written while it is read; choose another folder with --out"),
     ),
     Case("empty folder", lambda place: place.out.mkdir(), Succeeds()),
-    Case("results of an earlier run", all_of(results_of_an_earlier_run, SAVE), Succeeds()),
+    Case(
+        "results of an earlier run",
+        all_of(results_of_an_earlier_run, SAVE),
+        Succeeds(note="the results of an earlier run are replaced"),
+    ),
     Case(
         "read-only folder",
         make_read_only(lambda place: place.out),

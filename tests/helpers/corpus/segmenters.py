@@ -158,7 +158,7 @@ CASES = [
     Case(
         "a missing folder of id images",
         replace_options("--masks", "{root}/none"),
-        Fails("{root}/none: contains no PNG files; name the folder of the id images with --masks"),
+        Fails("{root}/none: does not exist; name the folder of the id images with --masks"),
     ),
     Case(
         "a file in place of the folder of id images",
