@@ -392,6 +392,15 @@ def test_bag_of_a_resumed_run_has_the_remaining_frames_and_its_own_odom(out: Pat
     assert (first.x, first.y, first.z) == pytest.approx((0, 0, 0), abs=1e-9)
 
 
+def test_sequence_that_was_moved_is_an_error_that_names_the_option(sequence: Path, tmp_path: Path) -> None:
+    room, out = tmp_path / "room", tmp_path / "out"
+    shutil.copytree(sequence, room)
+    interrupt_run(room, out, 4)
+    room.rename(tmp_path / "moved")
+    message = f"{room}: the sequence of the run in {out} is not there; give its new place with --seq"
+    assert_error_line(call("--resume", out), message)
+
+
 def test_new_run_does_not_replace_an_interrupted_one(sequence: Path, out: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
     done = call("--seq", sequence, "--out", out)

@@ -181,6 +181,10 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         check_unlocked(out)
         if _check_contents(out, masks, is_resumed=checkpoint is not None):
             print_line(console, f"note: {out}: the results of an earlier run are replaced")
+    if checkpoint is not None and Path(request.seq).is_absolute() and not os.path.lexists(request.seq):
+        raise InputError(
+            f"{request.seq}: the sequence of the run in {checkpoint.folder} is not there; give its new place with --seq"
+        )
     sequence = _open_sequence(request, console)
     print_notes(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:
@@ -194,8 +198,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         if not known_map.map.active_keyframes:
             raise InputError(f"{request.load_map}: has no keyframes; give the map of a run that found the camera")
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
-    if isinstance(segment, MaskFolder) and isinstance(sequence, Sized) and checkpoint is None:
-        segment.check_number(len(sequence))
+    if isinstance(segment, MaskFolder) and isinstance(sequence, RGBDSequence) and checkpoint is None:
+        segment.check_frames(sequence.stamps)
     if checkpoint is not None:
         _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
     viewer = display.make_viewer(sequence)

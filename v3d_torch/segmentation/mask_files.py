@@ -35,6 +35,10 @@ _MAX_INSTANCES = 255
 become a mask of full size."""
 
 
+_ADD_ID_IMAGE = "add it, or name the folder that belongs to this sequence"
+"""Advice if a frame has no id image."""
+
+
 class MaskFolder:
     """Instances from id images: single-channel PNG files, 8 or 16 bit, 0 = background, other values = instance ids.
 
@@ -78,22 +82,28 @@ class MaskFolder:
                 interval = float(self._stamps.sort().values.diff().median())
                 self._max_gap = min(_MAX_GAP, _MAX_GAP_RATIO * interval)
 
-    def check_number(self, frames: int) -> None:
-        """Check that files without timestamps in their names can belong to the frames in order.
+    def check_frames(self, stamps: Tensor) -> None:
+        """Check that there is an id image for each frame, before a run that would end at a frame without one.
 
-        A sequence has fewer frames than colour images if images have no partner, so that files made from all colour
-        images would belong to the wrong frames.
+        A sequence has fewer frames than colour images if images have no partner, so that files without timestamps in
+        their names, made from all colour images, would belong to the wrong frames.
 
         Args:
-            frames: Number of frames of the sequence.
+            stamps: Timestamps of the frames of the sequence, seconds, float64, shape :math:`(F,)`.
 
         Raises:
-            InputError: If the number of files is another one.
+            InputError: If a frame has no id image, or the number of files without timestamps is another one.
         """
-        if self._stamps is None and len(self._paths) != frames:
+        if self._stamps is None and len(self._paths) != len(stamps):
             raise InputError(
-                f"{self.folder}: has {len(self._paths)} id images for {frames} frames, and their names are not"
+                f"{self.folder}: has {len(self._paths)} id images for {len(stamps)} frames, and their names are not"
                 " timestamps; name each one by the timestamp of its frame, or write one for each frame"
+            )
+        missing = [i for i, stamp in enumerate(stamps.tolist()) if self.find_path(i, stamp) is None]
+        if missing:
+            raise InputError(
+                f"{self.folder}: has no id image for {len(missing)} of {len(stamps)} frames, the first of them frame"
+                f" {missing[0]} at {float(stamps[missing[0]]):.6f} s; {_ADD_ID_IMAGE}"
             )
 
     def __call__(self, frame: RGBDFrame) -> Instances:
@@ -115,8 +125,7 @@ class MaskFolder:
         path = self.find_path(frame.index, frame.stamp)
         if path is None:
             raise InputError(
-                f"{self.folder}: has no id image for frame {frame.index} at {frame.stamp:.6f} s;"
-                " add it, or name the folder that belongs to this sequence"
+                f"{self.folder}: has no id image for frame {frame.index} at {frame.stamp:.6f} s; {_ADD_ID_IMAGE}"
             )
         values = _read_ids(path)
         if values.shape != frame.image.shape[1:]:
