@@ -177,10 +177,10 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if request.save_map is not None:
         _check_map_path(Path(request.save_map), out, display)
     masks = _path(request.masks)
+    replaces_results = False
     if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
         check_unlocked(out)
-        if _check_contents(out, masks, is_resumed=checkpoint is not None):
-            print_line(console, f"note: {out}: the results of an earlier run are replaced")
+        replaces_results = _check_contents(out, masks, is_resumed=checkpoint is not None)
     if checkpoint is not None and Path(request.seq).is_absolute() and not os.path.lexists(request.seq):
         raise InputError(
             f"{request.seq}: the sequence of the run in {checkpoint.folder} is not there; give its new place with --seq"
@@ -204,6 +204,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
     viewer = display.make_viewer(sequence)
     folder = make_result_folder(out, sequence.name)
+    if replaces_results:
+        print_line(console, f"note: {folder}: the results of an earlier run are replaced")
     if checkpoint is not None:
         total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
         print_line(console, f"resuming after {checkpoint.frames} of {total} frames")

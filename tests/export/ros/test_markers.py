@@ -59,9 +59,9 @@ def test_convention_box_encloses_the_cloud_in_map() -> None:
     )
 
 
-def test_box_of_missed_object_is_at_its_predicted_centroid() -> None:
-    centroid = CLOUD.mean(dim=0).to(torch.float64) + torch.tensor([1.0, 0.0, 0.0])
-    box = markers_of(make_object(MotionState.DYNAMIC, centroid=centroid, missed=True))["boxes"]
+def test_box_of_missed_object_encloses_its_cloud_which_moves_with_the_prediction() -> None:
+    predicted = CLOUD + torch.tensor([1.0, 0.0, 0.0])
+    box = markers_of(make_object(MotionState.DYNAMIC, predicted, missed=True))["boxes"]
     assert components(box.pose.position) == pytest.approx([4.25, -2.5, -0.5])
 
 
