@@ -198,8 +198,11 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         if not known_map.map.active_keyframes:
             raise InputError(f"{request.load_map}: has no keyframes; give the map of a run that found the camera")
     segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
-    if isinstance(segment, MaskFolder) and isinstance(sequence, RGBDSequence) and checkpoint is None:
-        segment.check_frames(sequence.stamps)
+    if isinstance(segment, MaskFolder) and checkpoint is None:
+        if isinstance(sequence, Sized):
+            segment.check_number(len(sequence))
+        if isinstance(sequence, RGBDSequence) and not request.skip_broken:  # a broken frame needs no id image
+            segment.check_stamps(sequence.stamps)
     if checkpoint is not None:
         _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
     viewer = display.make_viewer(sequence)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +13,7 @@ import yaml
 from pydantic import ValidationError
 
 from v3d_torch.config import Config, Section
-from v3d_torch.config.validation import first_error
+from v3d_torch.config.validation import first_error, similar_key
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.io.paths import StrPath, expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
@@ -22,9 +21,6 @@ from v3d_torch.io.text_file import read_text, replace_odd_spaces
 
 _NUMBERS = {int: (1, 10**6), float: (1e-9, 1e9)}
 """Range of the magnitude of a number that is neither 0 nor infinite."""
-
-_MIN_SIMILARITY = 0.5
-"""Minimum similarity of an unknown key and the one that is suggested: others have no more in common than any words."""
 
 _LEADING_ZERO = re.compile(r"[-+]?0\d+")
 """Integer that is octal in YAML if all its digits are, and decimal otherwise: 010 is 8, and so is 008."""
@@ -185,6 +181,6 @@ def _advice(key: str, section: type[Section], prefix: str) -> str:
     *sections, leaf = key.split(".")
     if sections and sections[0] in section.model_fields:  # the notation of --set in a file
         return f"write nested sections, {''.join(f'{name}: {{' for name in sections)}{leaf}: ...{'}' * len(sections)}"
-    if near := difflib.get_close_matches(key.lower(), section.model_fields, n=1, cutoff=_MIN_SIMILARITY):
-        return f"did you mean {prefix}{near[0]}?"
+    if (near := similar_key(key, section.model_fields)) is not None:
+        return f"did you mean {prefix}{near}?"
     return f"choose from {', '.join(section.model_fields)}"

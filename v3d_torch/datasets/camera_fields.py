@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from difflib import get_close_matches
 from typing import Annotated, Any
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from v3d_torch.config.validation import first_error, to_float
+from v3d_torch.config.validation import first_error, similar_key, to_float
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import (
     MAX_DEPTH_DELAY,
@@ -61,17 +60,6 @@ class _CameraFile(BaseModel):
     inverse_depth_offset: Annotated[float, Field(ge=-MAX_INVERSE_DEPTH_OFFSET, le=MAX_INVERSE_DEPTH_OFFSET)] = 0.0
 
 
-def _describe(error: ValidationError) -> str:
-    """Describe what is wrong with the fields of a camera, and how to correct it; first a key that can be a slip."""
-    errors = {each["type"]: str(each["loc"][0]) for each in reversed(error.errors()) if each["loc"]}
-    if (unknown := errors.get("extra_forbidden")) is not None:
-        near = get_close_matches(unknown.lower(), _CameraFile.model_fields, n=1)
-        return f"unknown key {unknown}; {f'did you mean {near[0]}?' if near else 'remove it'}"
-    if (missing := errors.get("missing")) is not None:
-        return f"{missing} is missing; add it to the camera"
-    return f"{first_error(error)}; correct the camera"
-
-
 def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
     """Create a camera from unchecked fields.
 
@@ -113,6 +101,17 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
             f" {camera.width}x{camera.height} image; correct cx and cy, or width and height"
         )
     return camera
+
+
+def _describe(error: ValidationError) -> str:
+    """Describe what is wrong with the fields of a camera, and how to correct it; first a key that can be a slip."""
+    errors = {each["type"]: str(each["loc"][0]) for each in reversed(error.errors()) if each["loc"]}
+    if (unknown := errors.get("extra_forbidden")) is not None:
+        near = similar_key(unknown, _CameraFile.model_fields)
+        return f"unknown key {unknown}; {'remove it' if near is None else f'did you mean {near}?'}"
+    if (missing := errors.get("missing")) is not None:
+        return f"{missing} is missing; add it to the camera"
+    return f"{first_error(error)}; correct the camera"
 
 
 def check_principal_point(cx: float, cy: float, size: tuple[int, int], source: object) -> None:

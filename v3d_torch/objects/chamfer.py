@@ -57,10 +57,9 @@ def chamfer_distance(p: Tensor, q: Tensor, p_valid: Tensor | None = None, q_vali
     check_masks(p_valid=p_valid, q_valid=q_valid)
     check_shape("p", p, "B", "N", 3)
     check_shape("q", q, p.shape[0], "M", 3)
-    for name, valid, cloud in (("p_valid", p_valid, p), ("q_valid", q_valid, q)):
-        if valid is not None:
-            check_shape(name, valid, *cloud.shape[:2])
     p_valid, q_valid = mask_or_all(p_valid, p[..., 0]), mask_or_all(q_valid, q[..., 0])
+    check_shape("p_valid", p_valid, *p.shape[:2])
+    check_shape("q_valid", q_valid, *q.shape[:2])
     dtype = p.dtype
     # Padding is set to the origin: NaN would reach the gradients.
     p, q = (

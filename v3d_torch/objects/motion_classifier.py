@@ -169,9 +169,10 @@ class MotionClassifier(StatefulComponent):
         Args:
             objects: Result of the last call. Objects that the tracker does not have are left as they are.
         """
-        # A correction replaces the clouds of the tracks; in most frames there is no correction.
-        clouds = {id(each.cloud) for each in objects.objects}
-        moved = [track for track in self.tracker.tracks if id(track.newest.cloud) not in clouds]
+        # A correction replaces the clouds of the tracks; in most frames there is none. Missed objects have copies.
+        clouds = {each.id: each.cloud for each in objects.objects}
+        shown = [track for track in self.tracker.tracks if track.id in clouds]
+        moved = [track for track in shown if track.newest.cloud is not clouds[track.id]]
         corrected = {track.id: _world_attributes(track, self._last_stamp) for track in moved}
         return replace(objects, objects=[replace(each, **corrected.get(each.id, {})) for each in objects.objects])
 

@@ -82,23 +82,33 @@ class MaskFolder:
                 interval = float(self._stamps.sort().values.diff().median())
                 self._max_gap = min(_MAX_GAP, _MAX_GAP_RATIO * interval)
 
-    def check_frames(self, stamps: Tensor) -> None:
-        """Check that there is an id image for each frame, before a run that would end at a frame without one.
+    def check_number(self, frames: int) -> None:
+        """Check that files without timestamps in their names can belong to the frames in order.
 
-        A sequence has fewer frames than colour images if images have no partner, so that files without timestamps in
-        their names, made from all colour images, would belong to the wrong frames.
+        A sequence has fewer frames than colour images if images have no partner, so that files made from all colour
+        images would belong to the wrong frames.
+
+        Args:
+            frames: Number of frames of the sequence.
+
+        Raises:
+            InputError: If the number of files is another one.
+        """
+        if self._stamps is None and len(self._paths) != frames:
+            raise InputError(
+                f"{self.folder}: has {len(self._paths)} id images for {frames} frames, and their names are not"
+                " timestamps; name each one by the timestamp of its frame, or write one for each frame"
+            )
+
+    def check_stamps(self, stamps: Tensor) -> None:
+        """Check that there is an id image for each frame, before a run that would end at a frame without one.
 
         Args:
             stamps: Timestamps of the frames of the sequence, seconds, float64, shape :math:`(F,)`.
 
         Raises:
-            InputError: If a frame has no id image, or the number of files without timestamps is another one.
+            InputError: If a frame has no id image.
         """
-        if self._stamps is None and len(self._paths) != len(stamps):
-            raise InputError(
-                f"{self.folder}: has {len(self._paths)} id images for {len(stamps)} frames, and their names are not"
-                " timestamps; name each one by the timestamp of its frame, or write one for each frame"
-            )
         missing = [i for i, stamp in enumerate(stamps.tolist()) if self.find_path(i, stamp) is None]
         if missing:
             raise InputError(
