@@ -350,7 +350,7 @@ def test_objects_seen_by_a_lost_camera_move_into_the_map_when_it_is_found() -> N
         slam.odometry, slam.track_camera = guess, Track()
         for index in range(11):
             slam(walk[index])
-        people = [track for track in slam.classify_motion.tracker.tracks if track.label == PERSON]
+        people = [track for track in slam.classify_motion._tracker.tracks if track.label == PERSON]
         return {detection.stamp: detection.centroid for track in people for detection in track.detections}
 
     plain, found = places(()), places((8, 9))
@@ -396,7 +396,7 @@ def test_loop_closed_after_an_unmeasured_motion_corrects_objects_once() -> None:
     def places(T_new_old: Tensor) -> dict[float, Tensor]:
         """Return the centroids of the person by their times."""
         slam, _ = walk_with_loop(T_new_old, is_measured=False)
-        people = [track for track in slam.classify_motion.tracker.tracks if track.label == PERSON]
+        people = [track for track in slam.classify_motion._tracker.tracks if track.label == PERSON]
         return {detection.stamp: detection.centroid for track in people for detection in track.detections}
 
     plain, corrected = places(torch.eye(4, dtype=torch.float64)), places(LOOP_CORRECTION)
@@ -461,6 +461,34 @@ def test_gravity_of_the_first_frame_is_that_of_the_world(demo: RGBDSequence) -> 
     restored = V3DSLAM(demo.camera, config=NO_NETWORK)
     restored.load_state_dict(slam.state_dict())
     assert restored.gravity is not None and torch.equal(restored.gravity, down)
+
+
+def test_gravity_of_a_lost_frame_is_not_that_of_the_world(demo: RGBDSequence) -> None:
+    slam, down = V3DSLAM(demo.camera, config=NO_NETWORK), torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64)
+    slam(demo[0])
+    dark = replace(demo[1], image=torch.zeros_like(demo[1].image), gravity=-down)
+    assert slam(dark).status is TrackingStatus.LOST and slam.gravity is None
+    result = slam(replace(demo[2], gravity=down))
+    assert result.status.is_localised and slam.gravity is not None
+    torch.testing.assert_close(slam.gravity, result.T_wc[:3, :3] @ down)
+
+
+def test_rejected_frame_changes_nothing(demo: RGBDSequence) -> None:
+    segmented: list[int] = []
+
+    def segment(frame: RGBDFrame) -> Instances:
+        segmented.append(frame.index)
+        return Instances.empty(480, 640)
+
+    slam = V3DSLAM(demo.camera, segment, load_config(None, ("prefetch=false",)))
+    for index in range(2):
+        slam(demo[index])
+    before = [prediction.stamp for prediction in slam.predictions if prediction is not None]
+    for index in (0, 1):
+        with pytest.raises(InputError, match="that of the previous frame"):
+            slam(demo[index])
+    assert segmented == [0, 1]
+    assert [prediction.stamp for prediction in slam.predictions if prediction is not None] == before
 
 
 def test_level_frame_is_that_of_the_floor_without_gravity(demo: RGBDSequence) -> None:

@@ -215,6 +215,8 @@ class V3DSLAM(FramePreprocessor):
             InputError: If the frame is not valid, of another camera, or not later than the previous one.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
+        self.check(frame)
+        check_next(frame, self.poses.stamp)  # before the segmenter sees the frame, because it can have state
         preprocessed = self.preprocess(frame, self.predictions[0])
         self.advance_predictions()
         return self.track(preprocessed)
@@ -261,7 +263,7 @@ class V3DSLAM(FramePreprocessor):
             if view is not None and pose.status is not TrackingStatus.LOST:
                 T_dw = T_dc @ self.poses.T_cw
                 self.free_space_check.add_view(view, T_dw)
-                self.classify_motion.static_surfaces.add_view(view, T_dw, objects.static_without_people)
+                self.classify_motion.add_view(view, T_dw, objects.static_without_people)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, twist of the camera
@@ -429,11 +431,12 @@ class V3DSLAM(FramePreprocessor):
         is_other_part = self.poses.part != part
         if is_other_part:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
-            self.classify_motion.static_surfaces.drop_views()
+            self.classify_motion.drop_views()
         if pose.status is not TrackingStatus.LOST:
             guessed_T_cw = predicted_T_cw if T_new_old is None else predicted_T_cw @ invert(T_new_old)
-            self.classify_motion.tracker.register(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_other_part)
-        self.up_estimator.add_gravity(frame.gravity, self.poses.T_cw, T_new_old)
+            self.classify_motion.register(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_other_part)
+        is_pose_known = self.poses.is_localised or not self.poses.was_found  # until then, the world frame is temporary
+        self.up_estimator.add_gravity(frame.gravity if is_pose_known else None, self.poses.T_cw, T_new_old)
         if keyframe is not None:
             self.back_end.submit(keyframe)
         return keyframe

@@ -177,6 +177,20 @@ def test_warnings_of_a_run_are_on_the_console_and_in_the_tables(moment: Path, tm
     assert pd.read_parquet(out / "runs.parquet")["warnings"].tolist() == [warning, ""]
 
 
+def test_ground_truth_of_another_recording_is_told_in_batch_and_table(moment: Path, tmp_path: Path) -> None:
+    foreign, out = shutil.copytree(moment, tmp_path / "foreign"), tmp_path / "out"
+    lines = (foreign / "groundtruth.txt").read_text().splitlines()
+    poses = [line.split() for line in lines if not line.startswith("#")]
+    late = [" ".join([f"{float(stamp) + 1e6:.6f}", *pose]) for stamp, *pose in poses]
+    (foreign / "groundtruth.txt").write_text("\n".join(late) + "\n")
+    result = call("--seqs", moment, "--seqs", foreign, "--configs", "baseline", "--out", out)
+    assert_error_line(result, "1 of 2 runs have incomplete results; the causes are above")
+    diagnosis = metrics_of(out / "foreign" / "baseline" / "seed0")["diagnosis"]
+    shown = result.stdout.splitlines()
+    assert shown[shown.index("incomplete:") + 1] == f"foreign, baseline, seed 0: {diagnosis}"
+    assert pd.read_parquet(out / "runs.parquet")["diagnosis"].fillna("").tolist() == ["", diagnosis]
+
+
 # --- resume
 
 

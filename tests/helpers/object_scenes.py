@@ -446,8 +446,8 @@ class ObjectStage:
         self._is_lost = not guess.is_found
         if guess.is_found:
             self._free_space_check.add_view(view, invert(T_wc))
-            self._classify.static_surfaces.add_view(view, invert(T_wc), result.static_without_people)
-            self._classify.tracker.register(T_wc @ invert(guess.T_wc))
+            self._classify.add_view(view, invert(T_wc), result.static_without_people)
+            self._classify.register(T_wc @ invert(guess.T_wc))
         return result
 
     def move_world(self, T_new_old: Tensor) -> None:

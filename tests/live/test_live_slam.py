@@ -19,10 +19,11 @@ from torch import Tensor
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.live import LiveResult, LiveSLAM
-from v3d_torch.live.frame_capture import CapturedFrame
+from v3d_torch.live.frame_capture import CapturedFrame, FrameCapture
 from v3d_torch.live.latest_queue import LatestQueue
 from v3d_torch.live.live_preprocessor import LivePreprocessor
 from v3d_torch.objects.appearance import colour_histograms
+from v3d_torch.runtime.clock import MONOTONIC_CLOCK
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
@@ -227,6 +228,27 @@ def test_error_of_the_segmenter_ends_the_run() -> None:
 
     with pytest.raises(ValueError, match="network"):
         next(iter(LiveSLAM(feed()[0], V3DSLAM(CAMERA, segment))))
+
+
+def test_error_of_the_segmenter_for_a_frame_that_is_not_tracked_ends_the_run() -> None:
+    def segment(frame: RGBDFrame) -> Instances:
+        raise ValueError("network")
+
+    captured = LatestQueue[CapturedFrame]()
+    preprocessor = LivePreprocessor(captured, V3DSLAM(CAMERA, segment))
+    preprocessor.start()
+    captured.put(CapturedFrame(Wall()[0], 1, 0.0))
+    assert preprocessor.frames.take() is not None  # its instances are never asked for
+    with pytest.raises(ValueError, match="network"):
+        preprocessor.frames.take()
+    captured.close()
+    preprocessor.close()
+
+
+def test_threads_that_were_not_started_can_be_closed() -> None:
+    captured = LatestQueue[CapturedFrame]()
+    LivePreprocessor(captured, V3DSLAM(CAMERA, square)).close()
+    FrameCapture([], lambda frame: None, MONOTONIC_CLOCK).close()
 
 
 def test_leaving_the_loop_stops_all_threads() -> None:

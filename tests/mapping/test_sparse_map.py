@@ -296,6 +296,23 @@ def test_update_features_moves_the_landmarks_that_no_other_keyframe_observes() -
     assert error[1] < 0.1 * error[0]
 
 
+def test_update_features_ignores_removed_observations() -> None:
+    """A landmark whose other observation is an outlier is observed by its keyframe only."""
+    sparse_map = map_of_two_keyframes(KINECT)
+    first, columns = sparse_map.keyframes[0], sparse_map.observations
+    shared = torch.bincount(columns["landmark"]) == 2
+    of_first = columns["keyframe"] == 0
+    lonely, gone = torch.nonzero(shared)[:2, 0].tolist()
+    sparse_map.remove_observations(torch.nonzero(~of_first & (columns["landmark"] == lonely))[:, 0])
+    sparse_map.remove_observations(torch.nonzero(of_first & (columns["landmark"] == gone))[:, 0])
+    before = sparse_map.landmarks["point"].clone()
+    shift = se3_exp(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    sparse_map.update_features(first, first.features, shift @ first.T_cw)
+    moved = (sparse_map.landmarks["point"] - before).norm(dim=1)
+    assert moved[lonely] == pytest.approx(0.5, abs=1e-6) and moved[gone] == 0
+    assert (moved[torch.nonzero(shared)[2:, 0]] == 0).all()
+
+
 def test_update_features_leaves_the_landmarks_of_a_keyframe_whose_pose_depends_on_others() -> None:
     sparse_map = map_of_two_keyframes(KINECT)
     newest, before = sparse_map.keyframes[1], sparse_map.landmarks["point"].clone()

@@ -438,7 +438,7 @@ def test_missed_furniture_rests_without_a_mask_and_keeps_its_history() -> None:
     for _ in range(3):
         assert track_boards(Board(0.0, label=CHAIR, detected=False)) == []
     (resting,) = track_boards.tracker.resting
-    assert resting.missed and not resting.visible and resting.mask.numel() == 0
+    assert resting.missed and not resting.is_shown and resting.mask.numel() == 0
     (track,) = track_boards(Board(0.0, label=CHAIR))
     assert track is resting and len(track.detections) == 4 and track_boards.tracker.resting == []
 
@@ -504,7 +504,7 @@ def test_object_hidden_for_longer_than_the_maximum_lost_time_gets_a_new_id() -> 
     track_thrice(track_boards, Board(0.0, 3.0))
     cupboard = Board(0.0, 1.5, width=1.0, height=2.0, detected=False)
     for _ in range(70):
-        assert not any(track.visible for track in track_boards(Board(0.0, 3.0), cupboard))
+        assert not any(track.is_shown for track in track_boards(Board(0.0, 3.0), cupboard))
     assert track_boards.tracker.lost == []
     assert [track.id for track in track_boards(Board(0.0, 3.0))] == [2]
 
@@ -785,3 +785,24 @@ def test_state_dict_continues_with_identical_results() -> None:
                 assert torch.equal(track.predict_state(1.0).position, other.predict_state(1.0).position)
                 assert len(track.detections) == len(other.detections)
     assert [track.id for track in tracks] == [1, 2, 3]
+
+
+def test_end_of_a_guess_keeps_the_position_that_the_refined_mask_shows() -> None:
+    track_boards, offset = BoardTracker(), HERE.clone()
+    offset[0, 3] = 0.3
+    track_boards(Board(0.0))
+    track_boards.tracker.start_unregistered(1 / 30)
+    (track,) = track_boards.track(*render([Board(0.0)], HERE), 1 / 30, T_wc=offset)
+    surface = torch.tensor([0.4, 0.1, 2.0], dtype=torch.float64)
+    track.record_visible_state(surface)
+    track_boards.tracker.register(invert(offset))
+    expected = surface - offset[:3, 3]
+    torch.testing.assert_close(track.predict_visible_state(1 / 30).position, expected)
+    torch.testing.assert_close(track.history[-1].position, expected)
+
+
+def test_object_detected_again_is_shown() -> None:
+    track_boards = BoardTracker()
+    for frame in range(40):
+        (track,) = track_boards(Board(-0.6 + 0.03 * frame, detected=not 20 <= frame < 32))
+        assert track.is_shown is (frame < 23 or frame >= 32)

@@ -99,7 +99,7 @@ def test_predicted_mask_lacks_the_pixels_of_detected_objects_of_its_class(end: i
 def test_invisible_track_has_no_pixels_even_if_its_mask_was_refined() -> None:
     mask = box((10, 50), (20, 40))
     missed = track_of(mask, missed=True)
-    missed.visible = False
+    missed.is_shown = False
     (visible,) = visible_masks([missed], {missed: refined(mask)}, ALL_MEASURED)
     assert visible.shape == (HEIGHT, WIDTH) and not visible.any()
 

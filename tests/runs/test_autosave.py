@@ -99,7 +99,6 @@ def test_error_of_the_program_in_the_thread_ends_the_run_but_not_the_final_resul
     autosave()
     autosave.end()
     assert "autosave failed" in caplog.text and "ZeroDivisionError" in caplog.text
-    autosave._due = 0.0
     with pytest.raises(ZeroDivisionError):
         autosave()
 

@@ -130,6 +130,23 @@ def test_hook_of_one_stage_and_its_removal() -> None:
     assert len(seen) == 3
 
 
+@pytest.mark.parametrize("name", [None, "classify_motion"])
+def test_removed_hook_no_longer_calls_object_stages_without_masks(name: str | None) -> None:
+    config = SERIAL.model_copy(update={"segmentation": SERIAL.segmentation.model_copy(update={"source": "none"})})
+    slam, walk, seen = V3DSLAM(CAMERA, None, config), Walk(), []
+    slam(walk[0])
+    handle = slam.register_stage_hook(name, lambda name, *_: seen.append(name))
+    slam(walk[1])
+    handle.remove()
+    with_hook = len(seen)
+    slam.register_stage_hook("odometry", lambda name, *_: seen.append(name))
+    slam(walk[2])
+    assert "classify_motion" in seen[:with_hook] and seen[with_hook:] == ["odometry"]
+    calls, classify = [], slam.classify_motion
+    slam.classify_motion = lambda *args: calls.append(args) or classify(*args)  # type: ignore[assignment, func-returns-value]
+    assert slam._has_objects
+
+
 def test_hook_that_removes_itself_sees_one_call() -> None:
     slam, walk, seen = make_slam(), Walk(), []
 

@@ -49,6 +49,7 @@ _SCHEMA = pa.schema(
         ("difference", pa.string()),
         ("warnings", pa.string()),
         ("failure", pa.string()),
+        ("diagnosis", pa.string()),
         ("path", pa.string()),
     ]
 )
@@ -91,6 +92,11 @@ class BatchRecord:
     def failed(self) -> list[Outcome]:
         """Outcomes of the jobs that have failed."""
         return [outcome for outcome in self.outcomes if outcome.failure is not None]
+
+    @property
+    def incomplete(self) -> list[Outcome]:
+        """Outcomes of the jobs that have ended with incomplete results, such as no scores."""
+        return [outcome for outcome in self.outcomes if outcome.failure is None and outcome.diagnosis is not None]
 
     @property
     def missing(self) -> list[Job]:
@@ -173,6 +179,7 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         "difference": outcome.difference,
         "warnings": "\n".join(outcome.warnings),
         "failure": outcome.failure,
+        "diagnosis": outcome.diagnosis,
         "path": _relative_path(job, folder),
     }
 

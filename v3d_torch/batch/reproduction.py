@@ -52,7 +52,7 @@ def run_reproduction(
 
     Raises:
         V3DError: If the input is invalid or no sequence is available (before the first run), if the user interrupted
-            the batch, or if a run failed. The results of the other runs are written.
+            the batch, or if a run failed or has incomplete results. The results of the other runs are written.
     """
     check_resume(resume, out)
     console = wide_console()

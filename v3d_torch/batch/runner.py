@@ -41,8 +41,8 @@ def run_batch(
     """Run every sequence with every configuration and seed; arguments as in ``v3d-torch batch --help``.
 
     Raises:
-        V3DError: If the input is invalid (before the first run), if the batch was interrupted, or if a run failed. The
-            results of the other runs are written.
+        V3DError: If the input is invalid (before the first run), if the batch was interrupted, or if a run failed or
+            has incomplete results. The results of the other runs are written.
     """
     check_resume(resume, out)
     console = wide_console()
@@ -93,7 +93,8 @@ def run_missing_jobs(
 
     Raises:
         V3DError: If the folder contains runs or an ablation study, or its tables have runs that are not jobs of this
-            batch, or it is not writable; if the user interrupted the batch, or if a run failed.
+            batch, or it is not writable; if the user interrupted the batch, or if a run failed or has incomplete
+            results.
     """
     folder = record.folder
     if has_study_only(folder):  # times and memory of its runs are not those of single runs
@@ -112,12 +113,13 @@ def run_missing_jobs(
     interrupted = _run(record, executor, console)
     for table in record.screen_tables():
         console.print(table)
-    if record.failed:
-        console.print("failed:")
-        for outcome in record.failed:
+    for heading, outcomes in (("failed:", record.failed), ("incomplete:", record.incomplete)):
+        if outcomes:
+            console.print(heading)
+        for outcome in outcomes:
             print_line(console, str(outcome))
     print_line(console, f"results: {folder}")
-    total, failed = len(record.jobs), len(record.failed)
+    total, failed, incomplete = len(record.jobs), len(record.failed), len(record.incomplete)
     if interrupted and (failed or record.missing):
         done = len(record.outcomes) - failed
         raise InputError(
@@ -125,6 +127,8 @@ def run_missing_jobs(
         )
     if failed:
         raise InputError(f"{failed} of {total} runs failed; repeat the command with --resume to run them again{advice}")
+    if incomplete:
+        raise InputError(f"{incomplete} of {total} runs have incomplete results; the causes are above")
 
 
 def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:

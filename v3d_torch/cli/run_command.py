@@ -35,7 +35,7 @@ from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
-from v3d_torch.runs.request import CHANGEABLE, RunRequest
+from v3d_torch.runs.request import CHANGEABLE, RunRequest, check_not_moved
 from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.segmentation_files import SegmentationFiles
@@ -181,10 +181,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
         check_unlocked(out)
         replaces_results = _check_contents(out, masks, is_resumed=checkpoint is not None)
-    if checkpoint is not None and Path(request.seq).is_absolute() and not os.path.lexists(request.seq):
-        raise InputError(
-            f"{request.seq}: the sequence of the run in {checkpoint.folder} is not there; give its new place with --seq"
-        )
+    if checkpoint is not None:
+        check_not_moved(request, checkpoint.folder)
     sequence = _open_sequence(request, console)
     print_notes(sequence, console)
     if checkpoint is not None and (change := describe_change(checkpoint, sequence)) is not None:

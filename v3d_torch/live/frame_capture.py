@@ -73,7 +73,7 @@ class FrameCapture:
         self.frames.close()
         if isinstance(self._source, LiveStream):
             self._source.stop()
-        if threading.current_thread() is not self._thread:
+        if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join(_JOIN_TIMEOUT)
 
     def _run(self) -> None:

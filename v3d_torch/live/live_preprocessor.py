@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Thread
 
@@ -75,7 +75,8 @@ class LivePreprocessor:
     def close(self) -> None:
         """Stop the threads after their current frame. Close the queue of captured frames first."""
         self.frames.close()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._thread.join()
         self._segmenter.shutdown()
 
     def _run(self) -> None:
@@ -94,7 +95,7 @@ class LivePreprocessor:
         extraction = self._slam.extract_features(captured.frame)
         preprocessed = PreprocessedFrame(captured.frame, extraction, segmentation.result)
         self.frames.put(LiveFrame(captured, preprocessed, is_segmented))
-        wait([segmentation])
+        segmentation.result()  # also raises the error of a frame that is never tracked
 
     def _is_segmentation_due(self, number: int) -> bool:
         since_segmented, since_tracked = number - self._last_segmented, number - self._last_tracked

@@ -164,7 +164,8 @@ class SparseMap(MapTables):
                 pose.
         """
         keyframe.features = features
-        rows = torch.nonzero(self.observations["keyframe"] == keyframe.index)[:, 0]
+        valid = self.observations["valid"]
+        rows = torch.nonzero((self.observations["keyframe"] == keyframe.index) & valid)[:, 0]
         feature, landmark = (self.observations[name][rows] for name in ("feature", "landmark"))
         for name in ("uv", "inverse_depth", "readout_jacobian"):
             self.observations[name][rows] = getattr(features, name)[feature]
@@ -173,7 +174,7 @@ class SparseMap(MapTables):
             keyframe.T_cw = T_cw
         elif not bool(created.all()):
             return
-        is_own = created & (torch.bincount(self.observations["landmark"])[landmark] == 1)
+        is_own = created & (torch.bincount(self.observations["landmark"][valid])[landmark] == 1)
         moved = is_own & self.landmarks["active"][landmark] & (features.depth[feature] > 0)
         points = landmark_points(invert(keyframe.T_cw), features[feature[moved]], self.camera)
         self.landmarks["point"][landmark[moved]] = points

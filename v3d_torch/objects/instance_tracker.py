@@ -38,8 +38,8 @@ _DUPLICATE_DISTANCE = 0.5
 _MIN_FREE_FRACTION = 0.5
 """The predicted place of a missed object is empty if the camera sees through more than this fraction of its points."""
 
-_MAX_VISIBLE_TIME = 0.1
-"""A missed object counts as visible for this long, seconds: an object that is missed for longer is mostly hidden or has
+_MAX_SHOWN_TIME = 0.1
+"""A missed object is shown for this long, seconds: an object that is missed for longer is mostly hidden or has
 turned, so that its predicted mask is wrong. Tracking still leaves out the pixels of all predicted masks."""
 
 _MAX_OBSERVED_TIME = 0.2
@@ -67,6 +67,7 @@ class InstanceTracker(torch.nn.Module):
         tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
         resting: Tracks that cannot move by themselves and were missed for at most the maximum time.
         lost: Confirmed tracks that were missed for longer, or whose place another object occupies.
+        last_stamp: Timestamp of the last frame, seconds; -infinity before the first one.
         comparable_since: Time of the first detection that can be compared with the newest ones, seconds: before it, a
             motion of the camera was not measured.
     """
@@ -78,7 +79,7 @@ class InstanceTracker(torch.nn.Module):
         self._clouds = clouds
         self._stride = coarse_stride(camera)
         self._next_id = 1
-        self._last_stamp = -torch.inf
+        self.last_stamp = -torch.inf
         self.tracks: list[Track] = []
         self.resting: list[Track] = []
         self.lost: list[Track] = []
@@ -92,7 +93,7 @@ class InstanceTracker(torch.nn.Module):
             "resting": list(self.resting),
             "lost": list(self.lost),
             "next_id": self._next_id,
-            "last_stamp": self._last_stamp,
+            "last_stamp": self.last_stamp,
             "comparable_since": self.comparable_since,
             "unregistered_since": self._unregistered_since,
         }
@@ -105,7 +106,7 @@ class InstanceTracker(torch.nn.Module):
         """
         self.tracks, self.resting = list(state["tracks"]), list(state["resting"])
         self.lost = list(state["lost"])
-        self._next_id, self._last_stamp = state["next_id"], state["last_stamp"]
+        self._next_id, self.last_stamp = state["next_id"], state["last_stamp"]
         self.comparable_since, self._unregistered_since = state["comparable_since"], state["unregistered_since"]
 
     def forward(
@@ -147,7 +148,7 @@ class InstanceTracker(torch.nn.Module):
             masks = instances.masks[i], clouds.cloud_pixels[i], detected.masks[i]
             track = matches[i] = track or self._start_track(stamp, masks)
             track.add_detection(detection)
-            track.set_masks(*masks, missed=False)
+            track.set_masks(*masks, missed=False, is_shown=True)
             track.update_label(int(instances.labels[i]), float(instances.scores[i]))
             if detected.appearance is not None:
                 track.update_appearance(detected.appearance[i])
@@ -155,7 +156,7 @@ class InstanceTracker(torch.nn.Module):
 
         missed = self._predict_missed_tracks(stamp, depth, predicted, updated)
         self.tracks = sorted([*updated, *missed], key=lambda track: track.id)
-        self._last_stamp = stamp
+        self.last_stamp = stamp
         return list(self.tracks)
 
     def apply_world_correction(self, T_new_old: Tensor) -> None:
@@ -171,11 +172,13 @@ class InstanceTracker(torch.nn.Module):
         """Record that the motion of the camera before a frame was not measured.
 
         Detections from now on are not compared with earlier ones, and their world frame is not that of the map until
-        `register`.
+        `register`. Before the first frame there are no detections to compare.
 
         Args:
             stamp: Timestamp of the frame, seconds.
         """
+        if self.last_stamp == -torch.inf:
+            return
         self.comparable_since = stamp
         if self._unregistered_since is None:
             self._unregistered_since = stamp
@@ -289,14 +292,14 @@ class InstanceTracker(torch.nn.Module):
                 continue
             seen_through = predicted.silhouettes[i].count_seen_through(depth)
             if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
-                track.add_vacancy(stamp, min(stamp - self._last_stamp, _MAX_OBSERVED_TIME))
+                track.add_vacancy(stamp, min(stamp - self.last_stamp, _MAX_OBSERVED_TIME))
             if stamp - track.newest.stamp > self._config.max_missed_time or is_covered:
                 lost.append(track)
                 continue
             mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)
-            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True)
-            is_recent = stamp - track.newest.stamp <= _MAX_VISIBLE_TIME + STAMP_TOLERANCE
-            track.visible = bool(predicted.visible[i]) and track.is_confirmed and is_recent
+            is_recent = stamp - track.newest.stamp <= _MAX_SHOWN_TIME + STAMP_TOLERANCE
+            is_shown = bool(predicted.visible[i]) and track.is_confirmed and is_recent
+            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True, is_shown=is_shown)
             missed.append(track)
         self._update_tracks_without_masks(stamp, resting, lost)
         return missed

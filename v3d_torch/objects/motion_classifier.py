@@ -56,21 +56,16 @@ class MotionClassifier(StatefulComponent):
     Args:
         config: Configuration of the object stage.
         camera: Camera of all frames.
-
-    Attributes:
-        tracker: Tracks of the objects.
-        static_surfaces: Static surfaces of earlier views, to which each view is added once its pose is known.
     """
 
-    _STATE = ("_last_stamp", "tracker", "static_surfaces")
+    _STATE = ("_tracker", "_static_surfaces")
 
     def __init__(self, config: ObjectsConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._camera = camera
-        self._last_stamp = -torch.inf
         self._surface_centroids = SurfaceCentroids(config.clouds, camera)
-        self.tracker = InstanceTracker(config.tracker, camera, config.clouds)
-        self.static_surfaces = StaticSurfaces(config.free_space, camera)
+        self._tracker = InstanceTracker(config.tracker, camera, config.clouds)
+        self._static_surfaces = StaticSurfaces(config.free_space, camera)
 
     def __call__(
         self,
@@ -96,12 +91,13 @@ class MotionClassifier(StatefulComponent):
         """
         config, stamp = self._config, view.stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
-        if not view.is_motion_measured and self._last_stamp > -torch.inf:
-            self.tracker.start_unregistered(stamp)
-        tracks = self.tracker(stamp, instances, clouds, view.depth, invert(view.T_dw), appearance)
+        previous_stamp = self._tracker.last_stamp
+        if not view.is_motion_measured:
+            self._tracker.start_unregistered(stamp)
+        tracks = self._tracker(stamp, instances, clouds, view.depth, invert(view.T_dw), appearance)
         detected = [track for track in tracks if not track.missed]
         time_spans = (*config.voting.time_spans, config.chamfer.time_span)
-        pairs = detection_pairs(detected, time_spans, self.tracker.comparable_since)
+        pairs = detection_pairs(detected, time_spans, self._tracker.comparable_since)
 
         # Independent evidence, not in the paper: free space. An object of which most appeared needs no votes: a new one
         # has no earlier distance to compare, and of a known one this shows the motion directly.
@@ -109,7 +105,7 @@ class MotionClassifier(StatefulComponent):
         appeared = {track for track in detected if free_space.has_appeared(track)}
 
         # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
-        vote = hough_vote_evidence(pairs, free_space, self._last_stamp, config.voting)
+        vote = hough_vote_evidence(pairs, free_space, previous_stamp, config.voting)
         # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
         # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
@@ -124,7 +120,6 @@ class MotionClassifier(StatefulComponent):
         chamfer = chamfer_evidence(candidates, free_space, config.chamfer)
         for track in chamfer.deforming:
             track.mark_deforming(stamp)
-        self._last_stamp = stamp
 
         # Motion states, with memory over frames.
         for track, is_supported in zip(tracks, feature_support.supports(on_objects).tolist(), strict=True):
@@ -154,14 +149,37 @@ class MotionClassifier(StatefulComponent):
         ]
         return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
 
+    def register(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
+        """Transform what was detected in a guessed world frame into that of the map, see `InstanceTracker.register`.
+
+        Args:
+            T_new_old: Transform from the guessed world frame to that of the map, float64, shape :math:`(4, 4)`.
+            all_tracks: True to transform all detections, because they were made in another part of the map.
+        """
+        self._tracker.register(T_new_old, all_tracks=all_tracks)
+
+    def add_view(self, view: DepthView, T_dw: Tensor, static: Tensor) -> None:
+        """Store the static surfaces of a frame, once its pose is known, see `StaticSurfaces.add_view`.
+
+        Args:
+            view: Depth of the frame.
+            T_dw: Pose of the frame, world to camera, float64, shape :math:`(4, 4)`.
+            static: Pixels without people and moving objects, bool, shape :math:`(H, W)`.
+        """
+        self._static_surfaces.add_view(view, T_dw, static)
+
+    def drop_views(self) -> None:
+        """Drop the stored surfaces: the pose of the next frames relative to them is a guess."""
+        self._static_surfaces.drop_views()
+
     def apply_world_correction(self, T_new_old: Tensor) -> None:
         """Transform the tracks and the stored views into the corrected world.
 
         Args:
             T_new_old: Transform from the old to the corrected world, float64, shape :math:`(4, 4)`.
         """
-        self.tracker.apply_world_correction(T_new_old)
-        self.static_surfaces.apply_world_correction(T_new_old)
+        self._tracker.apply_world_correction(T_new_old)
+        self._static_surfaces.apply_world_correction(T_new_old)
 
     def apply_corrections(self, objects: FrameObjects) -> FrameObjects:
         """Return the objects of the last frame in the world frame to which the tracker was corrected since then.
@@ -171,9 +189,9 @@ class MotionClassifier(StatefulComponent):
         """
         # A correction replaces the clouds of the tracks; in most frames there is none. Missed objects have copies.
         clouds = {each.id: each.cloud for each in objects.objects}
-        shown = [track for track in self.tracker.tracks if track.id in clouds]
+        shown = [track for track in self._tracker.tracks if track.id in clouds]
         moved = [track for track in shown if track.newest.cloud is not clouds[track.id]]
-        corrected = {track.id: _world_attributes(track, self._last_stamp) for track in moved}
+        corrected = {track.id: _world_attributes(track, self._tracker.last_stamp) for track in moved}
         return replace(objects, objects=[replace(each, **corrected.get(each.id, {})) for each in objects.objects])
 
     def propagate_instances(self, view: DepthView) -> Instances:
@@ -182,7 +200,7 @@ class MotionClassifier(StatefulComponent):
         Args:
             view: Depth and pose of the frame.
         """
-        return propagate_instances(self.tracker.tracks, view, self._camera, self._config.clouds)
+        return propagate_instances(self._tracker.tracks, view, self._camera, self._config.clouds)
 
     def _refine_masks(
         self, excluded: Sequence[Track], tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied
@@ -190,7 +208,7 @@ class MotionClassifier(StatefulComponent):
         """Return the refined masks of the excluded objects and of all people; most excluded objects are people."""
         people = [track for track in tracks if track.label == PERSON]
         refinable = list(dict.fromkeys([*excluded, *people]))
-        refiner = MaskRefiner(refinable, view, newly_occupied, self.static_surfaces, self._config, self._camera)
+        refiner = MaskRefiner(refinable, view, newly_occupied, self._static_surfaces, self._config, self._camera)
         return {track: refiner.refine(track) for track in refinable}
 
     def _record_visible_states(

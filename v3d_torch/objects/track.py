@@ -100,8 +100,8 @@ class Track:
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
-        visible: True if the object was detected in the newest frame, or is confirmed, was missed for a short time only,
-            and the depth shows it at its predicted position.
+        is_shown: True if results show the object: it was detected in the newest frame, or is confirmed, was missed for
+            a short time only, and the depth shows it at its predicted position.
         is_confirmed: True if scores or motion have shown that the object exists.
         detections: Detections of the last second, newest last; after a longer gap the last two, if there are two.
         labels: Number of detections of each class. Once a detection had a score, those without one do not count.
@@ -127,7 +127,7 @@ class Track:
     cloud_pixels: Tensor
     coarse_mask: Tensor
     missed: bool = False
-    visible: bool = True
+    is_shown: bool = True
     is_confirmed: bool = False
     detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
@@ -299,8 +299,7 @@ class Track:
     def drop_masks(self) -> None:
         """Drop the masks: the object is not detected, and not predicted either."""
         nothing = torch.zeros(0, 0, dtype=torch.bool)
-        self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True)
-        self.visible = False
+        self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True, is_shown=False)
 
     def drop_old_detections(self) -> None:
         """Drop all but the newest detection: motion is not measured across a long absence."""
@@ -348,7 +347,9 @@ class Track:
             self.appearance = self.appearance.lerp(histogram, _APPEARANCE_RATE)
             self.appearance_points += _APPEARANCE_RATE * (len(self.newest.cloud) - self.appearance_points)
 
-    def set_masks(self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool) -> None:
+    def set_masks(
+        self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool, is_shown: bool
+    ) -> None:
         """Set the masks of the newest frame.
 
         Args:
@@ -356,8 +357,10 @@ class Track:
             cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
             coarse_mask: Every n-th pixel of the mask, packed, uint8, shape :math:`(B,)`.
             missed: True if the masks are predicted, because the object was not detected.
+            is_shown: True if results show the object.
         """
-        self.mask, self.cloud_pixels, self.coarse_mask, self.missed = mask, cloud_pixels, coarse_mask, missed
+        self.mask, self.cloud_pixels, self.coarse_mask = mask, cloud_pixels, coarse_mask
+        self.missed, self.is_shown = missed, is_shown
 
     def mark_dynamic(self, stamp: float) -> None:
         """Record that the frame at ``stamp``, seconds, shows a motion of the object."""
@@ -401,10 +404,13 @@ class Track:
         if since == -torch.inf:
             self._filter.apply_world_correction(T_new_old)
         elif self._filter.state.stamp >= since:  # the state combines measurements in both world frames
+            shown = self._filter.visible_state.transform(T_new_old)
             self._filter = ConstantVelocityKalmanFilter(self._config)
             for detection in self.detections:
                 if detection.stamp >= since:
                     self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
+            if self._filter.visible_state.is_known:  # the refined mask shows the same place as before
+                self._filter.correct_visible_position(shown.position)
 
     def _predict(self, state: ObjectState, stamp: float) -> ObjectState:
         moving = state.predict(min(stamp, state.stamp + _MAX_EXTRAPOLATION))

@@ -29,7 +29,7 @@ def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask],
         refined: Refined masks of some of them.
         missing: Pixels without depth, bool, shape :math:`(H, W)`.
     """
-    predicted = [track for track in tracks if track.missed and track.visible]
+    predicted = [track for track in tracks if track.missed and track.is_shown]
     # Only masks of these classes are changed.
     labels = {track.label for track in (*refined, *predicted)}
     detected = [track for track in tracks if not track.missed and track.label in labels]

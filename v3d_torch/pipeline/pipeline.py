@@ -23,7 +23,7 @@ from v3d_torch.errors import InputError, StageError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.io.text import first_line
-from v3d_torch.live.live_slam import LiveSLAM
+from v3d_torch.live.live_slam import LiveResult, LiveSLAM
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
 from v3d_torch.pipeline.frame_prefetcher import FramePrefetcher
@@ -217,7 +217,6 @@ class Pipeline:
         with closing(iter(live)) as results:
             for result in results:
                 self.between_frames = False
-                self.record.live.append_result(result)
                 self.record.rejected = live.rejected
                 yield result.frame, result
 
@@ -243,6 +242,8 @@ class Pipeline:
         self.record.repeated.add(frame.image)
         self.record.repeated_depth.add(frame.depth)
         self.record.states.append_state(result)
+        if isinstance(result, LiveResult):
+            self.record.live.append_result(result)
         self.record.dynamics.append_objects(frame, result, self.slam.up)
         with self._stopwatch.paused():  # the frame rate is that of the system, without the evaluation
             self._evaluate_masks(frame, result)

@@ -49,7 +49,13 @@ class Autosave:
         self._logged_error = ""
 
     def __call__(self) -> None:
-        """Save after a frame, if a save is due."""
+        """Save after a frame, if a save is due.
+
+        Raises:
+            Exception: The error of the program that ended the last save in the thread.
+        """
+        if self._saved is not None and self._saved.done():
+            self._saved.result()
         start = time.perf_counter()
         if start < self._due:
             return
@@ -58,8 +64,6 @@ class Autosave:
         if self._thread is None:
             self._save(write, start)
         else:
-            if self._saved is not None:
-                self._saved.result()  # an error of the program ends the run
             self._saved = self._thread.submit(self._save, write, start)
 
     def end(self) -> None:

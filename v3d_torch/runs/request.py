@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -151,6 +152,22 @@ def read_request(folder: Path) -> RunRequest:
         raise InputError(f"{path}: {first_error(error)}; run the sequence again") from error
     except ValueError as error:
         raise InputError(f"{path}: is not the request of a run ({error}); run the sequence again") from error
+
+
+def check_not_moved(request: RunRequest, folder: Path) -> None:
+    """Check that the sequence of an earlier run is still at its place.
+
+    Args:
+        request: Request that the run stored.
+        folder: Folder of the results of the run.
+
+    Raises:
+        InputError: If the request has a path that no longer exists.
+    """
+    if Path(request.seq).is_absolute() and not os.path.lexists(request.seq):
+        raise InputError(
+            f"{request.seq}: the sequence of the run in {folder} is not there; give its new place with --seq"
+        )
 
 
 def _absolute_if_exists(name: str) -> str:

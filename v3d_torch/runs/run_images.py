@@ -19,7 +19,7 @@ from v3d_torch.export.posed_image import PosedImage
 from v3d_torch.io.download import Progress
 from v3d_torch.io.image_file import read_image
 from v3d_torch.runs.file_names import MAP_MASKS
-from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.request import RunRequest, check_not_moved
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.types import RGBDFrame, Trajectory
 
@@ -36,7 +36,7 @@ def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) 
         progress: Callback for the progress of slow sources; None for no reports.
 
     Raises:
-        InputError: If the source is a live camera, or cannot be opened.
+        InputError: If the source is a live camera, was moved, or cannot be opened.
         DownloadError: If the source is missing and cannot be downloaded.
     """
     if is_live(request.seq):
@@ -44,6 +44,7 @@ def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) 
             f"{run.folder}: the images of a live camera are not stored; record them first with v3d-torch record, and"
             " run the recording"
         )
+    check_not_moved(request, run.folder)
     return open_source(
         request.seq,
         data_root=request.data_root,

@@ -21,7 +21,7 @@ from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
 from v3d_torch.runtime.stage_hooks import HookedStage, StageHook, without_hooks
 from v3d_torch.runtime.stage_import import make_stage
-from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy, StageProxy
+from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
 from v3d_torch.runtime.stateful import Stateful, is_stateful
 from v3d_torch.runtime.value_rules import FINITE, HISTOGRAMS, IDS, NOT_NEGATIVE, PAIRS, PIXELS, POSITIVE, RIGID
 from v3d_torch.tracking.camera_state import CameraState
@@ -177,7 +177,9 @@ class ReplaceableStages:
 
     def _is_changed(self, *names: str) -> bool:
         """Check whether any of these stages was replaced, or has a hook."""
-        return any(isinstance(vars(self)[name], StageProxy) for name in names)
+        with_hooks = {name for name, _ in self._stage_hooks.values()}
+        replaced = {name for name in names if isinstance(without_hooks(vars(self)[name]), ReplacedStage)}
+        return bool(replaced) or not with_hooks.isdisjoint((None, *names))
 
     def _replace_configured(self, config: Config, camera: PinholeCamera) -> None:
         """Replace the stages for which the configuration has an import path, but the segmenter, see `make_segmenter`.

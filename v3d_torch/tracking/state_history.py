@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -43,8 +43,7 @@ class StateHistory:
         """
         states = self._history.states
         first = max(bisect_right(states, state.stamp - _DURATION, key=_stamp) - 1, 0)
-        end = bisect_left(states, state.stamp, key=_stamp)
-        self._history = _History((*states[first:end], state))
+        self._history = _History((*states[first:], state))
 
     def append_motion(self, stamp: float, motion: CameraMotion) -> None:
         """Append the motion to a new frame whose state is not known yet: until `append`, it moves the last state.
