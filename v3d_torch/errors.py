@@ -45,5 +45,9 @@ class DepthScaleWarning(UserWarning):
     """The depth scale of a sequence is not stated, and was estimated from its images."""
 
 
+class StageWarning(UserWarning):
+    """A saved system had stages that were set in Python, which the loaded system lacks."""
+
+
 class NumericsError(V3DError):
     """A stage returned NaN or infinity; raised in debug mode by `v3d_torch.runs.numerics_check.CheckedSLAM`."""

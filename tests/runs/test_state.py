@@ -12,7 +12,7 @@ from helpers.walk_with_loop import CAMERA, CONFIG, Walk, interrupt_after, make_p
 
 from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.config.loading import load_config
-from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.errors import ConfigError, InputError, StageWarning
 from v3d_torch.io.state_file import write_state
 from v3d_torch.objects.feature_shift import FeatureShift
 from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
@@ -55,7 +55,7 @@ def test_state_has_the_shifts_of_features(tmp_path: Path) -> None:
     slam, walk = V3DSLAM(CAMERA, segment_red, CONFIG), Walk()
     for index in range(3):
         slam(walk[index])
-    (track, *_) = slam.classify_motion.tracker.tracks
+    (track, *_) = slam.classify_motion._tracker.tracks
     track.add_shift(track.newest.stamp, FeatureShift((3.0, 4.0), 0.5, torch.rand(12, 2)), 0.3)
     save_state(tmp_path / "slam.state", slam)
     loaded = load_state(tmp_path / "slam.state", segment_red)
@@ -88,6 +88,14 @@ def test_segmenter_of_one_system_does_not_change_the_results_of_another() -> Non
     for index in range(3):
         second(walk[index]), alone(walk[index])
     assert list(differences(segmenter_state_of(alone.segment), segmenter_state_of(second.segment), "votes", {})) == []
+
+
+def test_stages_that_are_not_in_the_file_are_named(tmp_path: Path) -> None:
+    slam = V3DSLAM(CAMERA, NoSegmentation(), CONFIG)
+    slam.smooth_depth = lambda depth: depth
+    save_state(tmp_path / "slam.state", slam)
+    with pytest.warns(StageWarning, match=r"that are not in the file: smooth_depth; set them again before the next"):
+        load_state(tmp_path / "slam.state", NoSegmentation())
 
 
 @pytest.mark.parametrize("stage", ["mapper", "classify_motion", "free_space_check"])

@@ -267,6 +267,38 @@ def test_stage_that_only_other_stages_call_cannot_be_replaced(stage: str) -> Non
         setattr(slam, stage, getattr(slam, stage))
 
 
+@pytest.mark.parametrize(
+    ("name", "stage"),
+    [("segmenter", "segment"), ("smooth_depht", "smooth_depth"), ("detect_feature", "detect_features")],
+)
+def test_misspelt_stage_is_named(name: str, stage: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{name} is not a stage; did you mean {stage}\\?$"):
+        setattr(make_slam(), name, lambda *_: None)
+
+
+def test_subclass_can_have_attributes_of_its_own() -> None:
+    class OwnSLAM(V3DSLAM):
+        def __init__(self) -> None:
+            super().__init__(CAMERA, segment, CONFIG)
+            self.robot = self.map_file = "kitchen"
+
+    assert OwnSLAM().robot == "kitchen"
+
+
+def test_class_in_place_of_a_stage_is_rejected() -> None:
+    with pytest.raises(ConfigError, match=r"^smooth_depth is the class Identity; set an object of this class$"):
+        make_slam().smooth_depth = torch.nn.Identity  # type: ignore[assignment]
+
+
+@pytest.mark.parametrize("layer", [torch.nn.BatchNorm2d(1), torch.nn.Dropout(0.5)])
+def test_network_in_training_mode_is_rejected(layer: torch.nn.Module) -> None:
+    slam, network = make_slam(), torch.nn.Sequential(torch.nn.Identity(), layer.train())
+    with pytest.raises(ConfigError, match=rf"^smooth_depth has layers in training mode \({type(layer).__name__}\)"):
+        slam.smooth_depth = network
+    slam.smooth_depth = network.eval()
+    slam(FRAMES[0])
+
+
 def test_every_stage_with_hooks_is_documented() -> None:
     page = (Path(__file__).parents[2] / "docs" / "your_stage.md").read_text()
     assert [name for name in STAGES if f"`{name}`" not in page] == []

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from v3d_torch.config import Config, StagesConfig, TrackerConfig
-from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.errors import ConfigError, InputError, StageWarning
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.paths import StrPath
@@ -52,12 +53,17 @@ def save_state(path: StrPath, slam: V3DSLAM) -> None:
         OutputError: If the file cannot be written.
         ConfigError: If a stage was replaced by one without state_dict.
     """
-    metadata = {"config": slam.config.model_dump(mode="json"), "camera": asdict(slam.camera)}
+    config = slam.config.model_dump(mode="json")
+    replaced = [name for name in slam.replaced_stages if name not in slam.config.stages.paths]
+    metadata = {"config": config, "camera": asdict(slam.camera), "replaced": replaced}
     write_state(Path(path), metadata, slam.state_dict())
 
 
 def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesConfig | None = None) -> V3DSLAM:
     """Load a system that `save_state` saved. With the same frames it gives the same results, to the bit.
+
+    Stages that were set in Python are not in the file: set them again before the next frame. A `StageWarning` names
+    them.
 
     Args:
         path: Path of a file written by `save_state`.
@@ -80,6 +86,9 @@ def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesCo
             raise ConfigError(f"{path}: would import code, {stage}; give load_state the stages that it may import")
         slam = V3DSLAM(camera, segment, config)
         slam.load_state_dict(state)
+        if replaced := metadata["replaced"]:
+            message = f"{path}: the saved system had stages of its own that are not in the file: {', '.join(replaced)}"
+            warnings.warn(f"{message}; set them again before the next frame", StageWarning, stacklevel=2)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is not the state of a system; pass a file that save_state wrote") from error
     return slam

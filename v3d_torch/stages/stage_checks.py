@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from typing import Any, cast
 
 import torch
@@ -103,12 +104,18 @@ _RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] |
 result is not checked."""
 
 
+_TRAINING_LAYERS = (torch.nn.modules.dropout._DropoutNd, torch.nn.modules.batchnorm._NormBase)
+"""Base classes of the layers whose results in training mode depend on chance or on earlier calls."""
+
 _INNER_STAGES = {
     "estimate_motion": "odometry",
     "track_map": "track_camera",
     "loop_closer": "track_camera and back_end",
 }
 """Stages that other stages call, and the names of these other stages."""
+
+_SIMILARITY = 0.8
+"""Similarity of two names, from 0 to 1, from which one is a misspelling of the other."""
 
 STAGES = ("segment", *(name for name in _RESULTS if name not in ("motion_model", "back_end")))
 """Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
@@ -127,16 +134,20 @@ class ReplaceableStages:
         """Set an attribute.
 
         Raises:
-            ConfigError: If a stage is set to a value that is not callable, or if the attribute is used
-                inside another stage only, so that its replacement would have no effect.
+            ConfigError: If a stage is set to a value that is not callable, to a class or to a network in training mode,
+                if the name is that of no attribute but similar to that of a stage, or if the attribute is used inside
+                another stage only, so that its replacement would have no effect.
         """
         if name in _INNER_STAGES and name in vars(self):
             raise ConfigError(
                 f"{name} cannot be replaced, because it is used inside {_INNER_STAGES[name]}; replace that instead"
             )
+        if not hasattr(self, name) and name not in (*STAGES, *_RESULTS):
+            for stage in get_close_matches(name, STAGES, n=1, cutoff=_SIMILARITY):
+                raise ConfigError(f"{name} is not a stage; did you mean {stage}?")
         value = without_hooks(value)  # those of this system are added below
-        if name in STAGES and not callable(value):
-            raise ConfigError(f"{name} is {describe_type(value)}, which cannot be called; set a stage")
+        if name in STAGES:
+            _check_stage(name, value)
         if name in _RESULTS and name in vars(self):
             value = ReplacedStage(value, name, vars(self)[name])
         previous = vars(self).get(name)
@@ -144,6 +155,11 @@ class ReplaceableStages:
             previous._hooks = {}  # the new stage can be a wrapper that calls it; hooks see the wrapper only
             value = HookedStage(value, name, self._stage_hooks)
         super().__setattr__(name, value)
+
+    @property
+    def replaced_stages(self) -> list[str]:
+        """Names of the stages that were replaced, except the segmenter."""
+        return [name for name in _RESULTS if isinstance(without_hooks(vars(self)[name]), ReplacedStage)]
 
     def register_stage_hook(self, name: str | None, hook: StageHook) -> RemovableHandle:
         """Register a function that is called after each call of a stage, as `torch.nn.Module.register_forward_hook`.
@@ -178,8 +194,7 @@ class ReplaceableStages:
     def _is_changed(self, *names: str) -> bool:
         """Check whether any of these stages was replaced, or has a hook."""
         with_hooks = {name for name, _ in self._stage_hooks.values()}
-        replaced = {name for name in names if isinstance(without_hooks(vars(self)[name]), ReplacedStage)}
-        return bool(replaced) or not with_hooks.isdisjoint((None, *names))
+        return not with_hooks.isdisjoint((None, *names)) or not set(names).isdisjoint(self.replaced_stages)
 
     def _replace_configured(self, config: Config, camera: PinholeCamera) -> None:
         """Replace the stages for which the configuration has an import path, but the segmenter, see `make_segmenter`.
@@ -246,6 +261,29 @@ def require_state(name: str, component: object) -> Stateful:
     if not is_stateful(component):
         raise ConfigError(f"{name} was replaced by a stage without state_dict; its state cannot be saved")
     return cast("Stateful", component)
+
+
+def _check_stage(name: str, stage: object) -> None:
+    """Check that a value can be a stage.
+
+    Args:
+        name: Name of its attribute in `V3DSLAM`.
+        stage: Value of the attribute.
+
+    Raises:
+        ConfigError: If it cannot be called, is a class, or has layers whose results depend on chance or earlier calls.
+    """
+    if isinstance(stage, type):
+        raise ConfigError(f"{name} is the class {stage.__name__}; set an object of this class")
+    if not callable(stage):
+        raise ConfigError(f"{name} is {describe_type(stage)}, which cannot be called; set a stage")
+    layers = stage.modules() if isinstance(stage, torch.nn.Module) else ()
+    training = [type(layer).__name__ for layer in layers if isinstance(layer, _TRAINING_LAYERS) and layer.training]
+    if training:
+        raise ConfigError(
+            f"{name} has layers in training mode ({training[0]}), whose results depend on chance or on earlier frames;"
+            " call its eval() first"
+        )
 
 
 def _check_value(name: str, value: object, expected: type | TensorSpec, sizes: dict[str, int]) -> None:
