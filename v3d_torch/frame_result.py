@@ -52,12 +52,13 @@ class PreprocessedFrame:
     Attributes:
         frame: Frame.
         extraction: Depth and features of the frame.
+        wait_for_segmentation: Function that returns the segmentation when it is complete.
         read_times: Time that reading the frame took, by stage; empty if it was not measured.
     """
 
     frame: RGBDFrame
     extraction: Extraction
-    _segmentation: Callable[[], Segmentation]
+    wait_for_segmentation: Callable[[], Segmentation]
     read_times: dict[str, StageTime] = field(default_factory=dict)
 
     @property
@@ -68,7 +69,7 @@ class PreprocessedFrame:
     @property
     def segmentation(self) -> Segmentation:
         """Instances of the frame. Waits for the segmentation if it is not complete yet."""
-        return self._segmentation()
+        return self.wait_for_segmentation()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -242,8 +242,8 @@ class FramePose:
         landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
         information: Information matrix of the left perturbation of ``T_cw``, under the assumption that the errors of
             the features are independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
-        is_relocalised: True if the camera was found again in the map. The change of the pose since the previous frame
-            then contains the error of the previous pose, and is no velocity.
+        is_relocalised: True if the camera was found in the map after a frame whose pose was not tracked in it. The
+            change of the pose since that frame then contains the error of its pose, and is no velocity.
     """
 
     status: TrackingStatus

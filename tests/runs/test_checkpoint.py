@@ -50,7 +50,7 @@ def test_comparison_finds_differences_in_private_attributes() -> None:
     first, second = make_pipeline(prefetch=False), make_pipeline(prefetch=False)
     assert list(differences(first, second, "run", {})) == []
     second.slam.mapper._most_tracked = 3
-    second.slam.classify_motion.tracker._next_id = 4
+    second.slam.classify_motion._tracker._next_id = 4
     assert len(list(differences(first, second, "run", {}))) == 2
 
 

@@ -29,7 +29,7 @@ class RealtimePlayback:
         clock: Clock of the computer.
 
     Attributes:
-        skipped: Number of frames that were skipped so far.
+        skipped: Number of frames that were skipped since the iteration began.
 
     Raises:
         InputError: If the source is already live.

@@ -109,7 +109,8 @@ class MotionClassifier(StatefulComponent):
         # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
         # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
-        shifted = self._shifted_tracks(tracks, feature_support, on_objects, view)
+        self._add_shifts(tracks, feature_support, on_objects, view)
+        shifted = {track for track in tracks if track.last_shifted == stamp}
         # The camera motion is measured relative to the object with most features, such as a table that fills the image.
         with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
         for track in (appeared | vote.dynamic | shifted) - with_most_inliers:
@@ -232,16 +233,15 @@ class MotionClassifier(StatefulComponent):
             if track.label in LIVING and not self._is_held_dynamic(track, stamp)
         }
 
-    def _shifted_tracks(
+    def _add_shifts(
         self, tracks: Sequence[Track], feature_support: FeatureSupport, on_objects: Tensor, view: DepthView
-    ) -> set[Track]:
-        """Return the objects whose features (``on_objects``) have moved against the camera motion."""
+    ) -> None:
+        """Add to each object how far its features (``on_objects``) have moved against the camera motion."""
         config = self._config.feature_shift
         if not config.enabled:
-            return set()
+            return
         for track, shift in zip(tracks, feature_support.shifts(on_objects, view.missing.shape), strict=True):
             track.add_shift(view.stamp, shift, config.time_span)
-        return {track for track in tracks if track.last_shifted == view.stamp}
 
     def _rigid_with_most_inliers(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
         """Return the rigid objects that have most of the inliers; people can have most of them on parts at rest."""

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import ParamSpec, TypeVar
 
@@ -93,8 +94,7 @@ class FramePrefetcher:
         if read is None:
             return None
         frame, times = read
-        segmentation = self._slam.segment_instances(frame, prediction)
-        return PreprocessedFrame(frame, self._slam.extract_features(frame), lambda: segmentation, times)
+        return replace(self._slam.preprocess(frame, prediction), read_times=times)
 
     def _read(self) -> ReadFrame:
         timer = StageTimer()

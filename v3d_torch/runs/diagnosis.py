@@ -9,8 +9,6 @@ from torch import Tensor
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.stored import StoredSequence
-from v3d_torch.errors import InputError
-from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.evaluation.evaluation import MIN_PAIRS
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.file_names import RunFile
@@ -34,13 +32,13 @@ _MIN_IMAGE_SIZE = 96
 """Minimum number of rows and of columns of an image in which enough features are found in most scenes."""
 
 
-def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | None) -> str | None:
+def diagnose(pipeline: Pipeline, request: RunRequest, evaluation_error: str | None) -> str | None:
     """Explain incomplete results of a run that ended without an error.
 
     Args:
         pipeline: Pipeline that has run.
         request: Inputs of the run.
-        evaluation: Its scores; None if there are none.
+        evaluation_error: Why it could not be scored, see `ResultTables`; None if it was, or without ground truth.
 
     Returns:
         One sentence with cause and fix; None if the results are complete.
@@ -49,7 +47,7 @@ def diagnose(pipeline: Pipeline, request: RunRequest, evaluation: Evaluation | N
     if not count:
         return f"{name}: has no frames; record it again"
     if pipeline.slam.poses.was_found:
-        return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation)
+        return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation_error)
     if request.load_map is not None:
         return (
             f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
@@ -125,14 +123,11 @@ def _count_features(pipeline: Pipeline, frame: RGBDFrame) -> int:
     return int((pipeline.slam.extract_features(frame).features.depth > 0).sum())
 
 
-def _cause_of_missing_scores(pipeline: Pipeline, evaluation: Evaluation | None) -> str | None:
-    sequence, trajectory = pipeline.sequence, pipeline.slam.poses.trajectory()
+def _cause_of_missing_scores(pipeline: Pipeline, evaluation_error: str | None) -> str | None:
+    sequence = pipeline.sequence
     stored = stored_source(sequence)
     if isinstance(stored, StoredSequence) and stored.groundtruth_error is not None:
         return str(stored.groundtruth_error)
-    if evaluation is None and sequence.groundtruth is not None and len(trajectory) >= MIN_PAIRS:
-        try:
-            evaluate(sequence.groundtruth, trajectory)
-        except InputError as error:
-            return f"{sequence.name}: has no scores, {error}"
+    if evaluation_error is not None and len(pipeline.slam.poses) >= MIN_PAIRS:
+        return f"{sequence.name}: has no scores, {evaluation_error}"
     return None

@@ -29,7 +29,7 @@ def interrupts_between_frames(source: RGBDStream | None = None) -> Iterator[Even
         source: Source of the frames. The signal also stops a `LiveStream`, because the next frame of a camera that was
             unplugged may never come. None, or a source of another kind, is not stopped.
 
-    Returns:
+    Yields:
         Event that is set by the signal.
 
     Raises:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +57,7 @@ class ResultTables:
         keyframes: Poses of the keyframes of the run.
         groundtruth: True poses, if there are any.
         evaluation: Scores, if there is ground truth, the camera was found, and there are enough poses.
+        evaluation_error: Why there are no scores although there is ground truth and the camera was found; else None.
         config: Configuration, YAML.
         frames: Table of frames.
         states: Table of the states of the camera.
@@ -68,6 +68,7 @@ class ResultTables:
     keyframes: Trajectory
     groundtruth: Trajectory | None
     evaluation: Evaluation | None
+    evaluation_error: str | None
     config: str
     frames: pa.Table
     states: pa.Table
@@ -95,16 +96,19 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
     trajectory = slam.poses.trajectory()
     keyframes = slam.map.own_keyframes
     stamps = torch.tensor([keyframe.stamp for keyframe in keyframes], dtype=torch.float64)
-    evaluation = None
+    evaluation, evaluation_error = None, None
     if groundtruth is not None and slam.poses.was_found:
-        with suppress(InputError):  # too few poses for scores
+        try:
             is_localised = torch.tensor([status.is_localised for status in slam.poses.statuses])
             evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count, is_localised=is_localised)
+        except InputError as error:
+            evaluation_error = str(error)
     return ResultTables(
         trajectory=trajectory,
         keyframes=Trajectory(stamps, invert(stack_poses(keyframes))),
         groundtruth=groundtruth,
         evaluation=evaluation,
+        evaluation_error=evaluation_error,
         config=dump_config(slam.config),
         frames=_frame_table(pipeline),
         states=make_state_table(pipeline.record),

@@ -74,7 +74,7 @@ def write_results(folder: Path, pipeline: Pipeline, request: RunRequest | None =
     point_map = pipeline.fuse_points()
     if request is not None and record.failure is None:
         pipeline.warn(check_lost_frames(pipeline))
-        record.diagnosis = diagnose(pipeline, request, tables.evaluation)
+        record.diagnosis = diagnose(pipeline, request, tables.evaluation_error)
     _write_maps(folder, pipeline, tables.trajectory, point_map)
     draw_run(folder / FIGURES, pipeline, tables.trajectory, point_map)
     metrics |= {"failure": record.failure, "diagnosis": record.diagnosis, "warnings": record.warnings}
