@@ -22,6 +22,7 @@ from v3d_torch.objects.mask_propagation import propagate_instances
 from v3d_torch.objects.mask_refiner import MaskRefiner, RefinedMask
 from v3d_torch.objects.motion_evidence import (
     DetectionPairs,
+    MotionEvidence,
     chamfer_evidence,
     detection_pairs,
     free_space_evidence,
@@ -89,49 +90,24 @@ class MotionClassifier(StatefulComponent):
         Returns:
             Objects with their motion states, and the static mask.
         """
-        config, stamp = self._config, view.stamp
+        stamp, previous_stamp = view.stamp, self._tracker.last_stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
-        previous_stamp = self._tracker.last_stamp
         if not view.is_motion_measured:
             self._tracker.start_unregistered(stamp)
         tracks = self._tracker(stamp, instances, clouds, view.depth, invert(view.T_dw), appearance)
-        detected = [track for track in tracks if not track.missed]
-        time_spans = (*config.voting.time_spans, config.chamfer.time_span)
-        pairs = detection_pairs(detected, time_spans, self._tracker.comparable_since)
-
-        # Independent evidence, not in the paper: free space. An object of which most appeared needs no votes: a new one
-        # has no earlier distance to compare, and of a known one this shows the motion directly.
-        free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
-        appeared = {track for track in detected if free_space.has_appeared(track)}
-
-        # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
-        vote = hough_vote_evidence(pairs, free_space, previous_stamp, config.voting)
-        # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
-        # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
-        on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
-        self._add_shifts(tracks, feature_support, on_objects, view)
-        shifted = {track for track in tracks if track.last_shifted == stamp}
-        # The camera motion is measured relative to the object with most features, such as a table that fills the image.
-        with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
-        for track in (appeared | vote.dynamic | shifted) - with_most_inliers:
-            track.mark_dynamic(stamp)
-
-        # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
-        candidates = self._deformation_candidates(pairs[config.chamfer.time_span], stamp)
-        chamfer = chamfer_evidence(candidates, free_space, config.chamfer)
-        for track in chamfer.deforming:
-            track.mark_deforming(stamp)
+        evidence = self._collect_evidence(tracks, previous_stamp, view, newly_occupied, feature_support)
 
         # Motion states, with memory over frames.
-        for track, is_supported in zip(tracks, feature_support.supports(on_objects).tolist(), strict=True):
-            track.mark_supported(stamp, is_supported)
-        motion_states = {track: self._motion_state(track, free_space.appeared[track], stamp) for track in tracks}
+        appeared = evidence.free_space.appeared
+        motion_states = {track: self._motion_state(track, appeared[track], stamp) for track in tracks}
 
         # Masks, refined by depth, and the positions that they show.
         excluded = [track for track in tracks if not self._is_trackable(motion_states[track])]
         refined = self._refine_masks(excluded, tracks, view, newly_occupied)
         size = view.missing.shape
-        masks = static_masks([refined[track] for track in excluded], list(refined.values()), size, config.static_mask)
+        masks = static_masks(
+            [refined[track] for track in excluded], list(refined.values()), size, self._config.static_mask
+        )
         visible = visible_masks(tracks, refined, view.missing)
         self._record_visible_states(dict(zip(tracks, visible, strict=True)), refined, view)
 
@@ -140,15 +116,15 @@ class MotionClassifier(StatefulComponent):
                 id=track.id,
                 label=track.label,
                 mask=mask,
-                votes=vote.votes.get(track, 0),
-                chamfer=chamfer.distances.get(track, torch.nan),
+                votes=evidence.vote.votes.get(track, 0),
+                chamfer=evidence.chamfer.distances.get(track, torch.nan),
                 motion_state=motion_states[track],
                 missed=track.missed,
                 **_world_attributes(track, stamp),
             )
             for track, mask in zip(tracks, visible, strict=True)
         ]
-        return FrameObjects(objects, masks.static, masks.without_people, vote.vote_pairs)
+        return FrameObjects(objects, masks.static, masks.without_people, evidence.vote.vote_pairs)
 
     def register(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
         """Transform what was detected in a guessed world frame into that of the map, see `InstanceTracker.register`.
@@ -202,6 +178,55 @@ class MotionClassifier(StatefulComponent):
             view: Depth and pose of the frame.
         """
         return propagate_instances(self._tracker.tracks, view, self._camera, self._config.clouds)
+
+    def _collect_evidence(
+        self,
+        tracks: list[Track],
+        previous_stamp: float,
+        view: DepthView,
+        newly_occupied: NewlyOccupied,
+        feature_support: FeatureSupport,
+    ) -> MotionEvidence:
+        """Collect the evidence of motion in a frame, and record it in the tracks.
+
+        Args:
+            tracks: Tracks of the frame, detected or missed.
+            previous_stamp: Timestamp of the previous frame, seconds.
+            view: Depth of the frame, with the pose from frame-to-frame motion.
+            newly_occupied: Newly occupied pixels of the frame.
+            feature_support: Features of the frame and their agreement with the camera motion.
+        """
+        config, stamp = self._config, view.stamp
+        detected = [track for track in tracks if not track.missed]
+        time_spans = (*config.voting.time_spans, config.chamfer.time_span)
+        pairs = detection_pairs(detected, time_spans, self._tracker.comparable_since)
+
+        # Independent evidence, not in the paper: free space. An object of which most appeared needs no votes: a new one
+        # has no earlier distance to compare, and of a known one this shows the motion directly.
+        free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
+        appeared = {track for track in detected if free_space.has_appeared(track)}
+
+        # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
+        vote = hough_vote_evidence(pairs, free_space, previous_stamp, config.voting)
+
+        # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
+        # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
+        on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
+        self._add_shifts(tracks, feature_support, on_objects, view)
+        shifted = {track for track in tracks if track.last_shifted == stamp}
+        # The camera motion is measured relative to the object with most features, such as a table that fills the image.
+        with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
+        for track in (appeared | vote.dynamic | shifted) - with_most_inliers:
+            track.mark_dynamic(stamp)
+        for track, is_supported in zip(tracks, feature_support.supports(on_objects).tolist(), strict=True):
+            track.mark_supported(stamp, is_supported)
+
+        # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
+        candidates = self._deformation_candidates(pairs[config.chamfer.time_span], stamp)
+        chamfer = chamfer_evidence(candidates, free_space, config.chamfer)
+        for track in chamfer.deforming:
+            track.mark_deforming(stamp)
+        return MotionEvidence(free_space, vote, chamfer)
 
     def _refine_masks(
         self, excluded: Sequence[Track], tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied

@@ -209,3 +209,18 @@ def chamfer_evidence(pairs: DetectionPairs, free_space: FreeSpaceEvidence, confi
         if motion.deforming and free_space.allows_motion(track, previous, DEFORMED_FRACTION):
             deforming.add(track)
     return ChamferEvidence(distances, deforming)
+
+
+@dataclass(frozen=True)
+class MotionEvidence:
+    """Evidence of motion in a frame.
+
+    Attributes:
+        free_space: Pixels of the objects that appeared or vacated.
+        vote: Votes over all time spans.
+        chamfer: Distances between clouds of objects that the vote leaves as static.
+    """
+
+    free_space: FreeSpaceEvidence
+    vote: VoteEvidence
+    chamfer: ChamferEvidence
