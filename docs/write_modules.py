@@ -42,6 +42,9 @@ libraries for the CPU. Three of them then differ: `voxel_pool` returns as many v
 `essential_ransac` and `pnp_ransac` take hypotheses from other solvers, so that the table compares only shapes and
 dtypes of their results. The table was measured without a GPU.
 
+`torch.jit.trace`, which the older exporter to ONNX uses, records the torch functions, too, but only for the sizes of
+its example. It raises an `InputError` for `dbscan`, `match_descriptors` and `ate`. Use `torch.export` where possible.
+
 The other public functions and classes take maps, sequences, frames or files, not only tensors: they run on the CPU.
 """
 

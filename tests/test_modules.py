@@ -301,6 +301,109 @@ def test_poses_and_landmarks_that_are_not_finite_are_rejected(title: str, name: 
         CASES[title].function(**inputs)
 
 
+def change_value(values: Tensor, index: tuple[int, ...], value: float) -> Tensor:
+    """Copy of a tensor with another value at an index of all problems of a batch."""
+    changed = values.clone()
+    changed[:, *index] = value
+    return changed
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+@pytest.mark.parametrize("name", ["pixel_sigma", "inverse_depth_sigma"])
+@pytest.mark.parametrize("title", ["PoseRefiner", "BundleAdjuster", "ReadoutEstimator"])
+def test_standard_deviation_that_is_not_positive_is_rejected(title: str, name: str, value: float) -> None:
+    """Poses became NaN, or the prediction was returned."""
+    inputs = CASES[title].inputs(1, 30, torch.float64)
+    first = int(inputs["valid"][0].nonzero()[0])
+    sigma = torch.full_like(inputs["inverse_depth"], 0.5)
+    with pytest.raises(v3d.InputError, match=f"^{name} has a value that is not positive"):
+        CASES[title].function(**inputs | {name: change_value(sigma, (first,), value)})
+    inputs["valid"][:, first] = False
+    CASES[title].function(**inputs | {name: change_value(sigma, (first,), value)})  # padding
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "message"),
+    [
+        (0, 0, math.nan, "a value that is not finite"),
+        (1, 2, math.inf, "a value that is not finite"),
+        (0, 0, 0.0, "a focal length that is not positive"),
+        (1, 1, -500.0, "a focal length that is not positive"),
+        (2, 0, 320.0, "a last row other than"),
+        (2, 2, 2.0, "a last row other than"),
+    ],
+)
+@pytest.mark.parametrize("title", ["PoseRefiner", "PnPRANSAC", "BundleAdjuster", "ReadoutEstimator"])
+def test_matrix_of_no_pinhole_camera_is_rejected(title: str, row: int, column: int, value: float, message: str) -> None:
+    inputs = CASES[title].inputs(1, 30, torch.float64)
+    with pytest.raises(v3d.InputError, match=f"^K has {message}"):
+        CASES[title].function(**inputs | {"K": change_value(inputs["K"], (row, column), value)})
+
+
+@pytest.mark.parametrize("title", ["PoseRefiner", "BundleAdjuster"])
+def test_skew_is_ignored(title: str) -> None:
+    inputs = CASES[title].inputs(1, 30, torch.float64)
+    skewed = inputs | {"K": change_value(inputs["K"], (0, 1), 5.0)}
+    assert_same(CASES[title].function(**skewed), CASES[title].function(**inputs))
+
+
+CAMERA_INPUTS = [(title, name) for title, case in CAMERA_CASES.items() for name in case.inputs(1, 8, torch.float64)]
+
+
+@pytest.mark.parametrize(("title", "name"), CAMERA_INPUTS)
+def test_array_instead_of_a_tensor_is_rejected(title: str, name: str) -> None:
+    inputs = CASES[title].inputs(1, 8, torch.float64)
+    with pytest.raises(v3d.InputError, match=rf"^{name} (is of|has the) type .*; give"):
+        CASES[title].function(**inputs | {name: inputs[name].numpy()})  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize("name", ["pixel_sigma", "inverse_depth_sigma"])
+@pytest.mark.parametrize("title", ["PoseRefiner", "BundleAdjuster", "ReadoutEstimator"])
+def test_array_of_standard_deviations_is_rejected(title: str, name: str) -> None:
+    inputs = CASES[title].inputs(1, 8, torch.float64)
+    with pytest.raises(v3d.InputError, match=rf"^{name} is of type ndarray; give a torch.Tensor"):
+        CASES[title].function(**inputs | {name: inputs["inverse_depth"].numpy()})  # type: ignore[dict-item]
+
+
+# ---------------------------------------------------------------- traces
+
+
+NOT_TRACED = {"DBSCAN", "DescriptorMatcher", "ate"}
+TRACED = {
+    name: case
+    for name, case in (CASES | FUNCTION_CASES).items()
+    if name not in {*NOT_TRACED, "align_depth"} and not case.sampled
+}
+
+
+def trace(case: Case, inputs: Inputs) -> Callable[..., tuple[Tensor, ...]]:
+    def function(*arguments: Tensor) -> tuple[Tensor, ...]:
+        return tensors(case.function(**dict(zip(inputs, arguments, strict=True))))
+
+    traced: Callable[..., tuple[Tensor, ...]] = torch.jit.trace(function, tuple(inputs.values()), check_trace=False)
+    return traced
+
+
+@pytest.mark.filterwarnings("ignore")  # deprecation of torch.jit, and each shape that is checked
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("case", TRACED.values(), ids=TRACED)
+def test_trace_gives_the_result_for_other_values(case: Case, dtype: torch.dtype) -> None:
+    """The traces had the results for the example, and sometimes whatever was in its memory later."""
+    inputs = case.inputs(3, 12, dtype)
+    others = {name: each.flip(0) for name, each in inputs.items()}
+    found = trace(case, inputs)(*others.values())
+    for one, other in zip(found, tensors(case.function(**others)), strict=True):
+        torch.testing.assert_close(without_padding(one, other), other, rtol=1e-4, atol=1e-4, equal_nan=True)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", sorted(NOT_TRACED))
+def test_trace_of_steps_that_depend_on_sizes_is_rejected(name: str) -> None:
+    case = (CASES | FUNCTION_CASES)[name]
+    with pytest.raises(v3d.InputError, match=r"^torch.jit.trace cannot record \w+; use torch.export.export$"):
+        trace(case, case.inputs(2, 12, torch.float64))
+
+
 # ---------------------------------------------------------------- gradients
 
 
@@ -358,6 +461,19 @@ def with_direction(title: str, name: str) -> tuple[Callable[[Tensor], tuple[Tens
         return tensors(case.function(**inputs | {name: argument}))
 
     return function, inputs[name], random(*inputs[name].shape, dtype=torch.float64, seed=3) - 0.5
+
+
+@pytest.mark.parametrize(("title", "name"), [each for each in ARGUMENTS if each[0] in IMPLICIT])
+def test_second_derivative_of_an_optimum_is_an_error(title: str, name: str) -> None:
+    """It was that of a step with a constant Hessian."""
+    inputs = CASES[title].inputs(1, 12, torch.float64)
+    inputs[name].requires_grad_()
+    loss = tensors(CASES[title].function(**inputs))[0].square().sum()
+    (gradient,) = torch.autograd.grad(loss, inputs[name], create_graph=True)
+    (alone,) = torch.autograd.grad(tensors(CASES[title].function(**inputs))[0].square().sum(), inputs[name])
+    torch.testing.assert_close(gradient, alone, rtol=1e-4, atol=1e-5)
+    with pytest.raises(v3d.InputError, match=r"^the optimum of a solver has no second derivatives"):
+        torch.autograd.grad(gradient.square().sum(), inputs[name])
 
 
 @pytest.mark.parametrize(("title", "name"), [each for each in ARGUMENTS if each[0] in IMPLICIT])

@@ -339,3 +339,25 @@ def test_pypose_types_give_the_same_result_and_gradient() -> None:
     torch.testing.assert_close(found.T_wc.matrix(), expected.T_wc, rtol=0, atol=1e-9)
     se3_log(expected.T_wc).square().sum().backward()
     torch.testing.assert_close(by_pypose.grad.as_subclass(Tensor), xi.grad, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("twin", ["torch", "compiled"])
+def test_skew_part_of_the_information_changes_nothing(twin: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has no influence on the cost, but the step used it."""
+    graph = Graph(12, 4)
+    monkeypatch.setattr(compiler, "ENABLED", compiler.ENABLED and twin == "compiled")
+    change = RandomNumbers(1).normal(len(graph.edges), 6, 6).round() * 2**10
+    expected = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information)
+    found = optimise_pose_graph(graph.start, graph.edges, graph.T_ij, graph.information + change - change.mT)
+    torch.testing.assert_close(found.T_wc, expected.T_wc, rtol=0, atol=1e-12)
+    torch.testing.assert_close(found.cost_after, expected.cost_after)
+
+
+def test_negative_information_is_an_error() -> None:
+    graph = Graph(5, 1)
+    information = graph.information.clone()
+    information[1, 3, 3] = -1
+    with pytest.raises(InputError, match=r"^information has a negative value on a diagonal"):
+        optimise_pose_graph(graph.start, graph.edges, graph.T_ij, information)
+    present = torch.arange(len(graph.edges)) != 1
+    optimise_pose_graph(graph.start, graph.edges, graph.T_ij, information, valid=present)

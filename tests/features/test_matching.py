@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import kornia_rs
 import numpy as np
@@ -13,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from kornia.core.exceptions import ShapeError
 
-from v3d_torch.errors import InputError
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.features.matching import hamming_distance, match_descriptors
 from v3d_torch.kernels.compiler import ENABLED, TWINS
 
@@ -136,3 +138,11 @@ def test_matches_with_padding_are_those_without_it(
         pairs = _pairs(match_descriptors(a[k, a_valid[k]], b[k, b_valid[k]], **limits))
         expected[a_valid[k].nonzero()[pairs[:, 0], 0]] = b_valid[k].nonzero()[pairs[:, 1], 0]
         assert torch.equal(found[k], expected)
+
+
+@pytest.mark.parametrize(("name", "value"), [("max_ratio", math.nan), ("max_ratio", -0.1), ("max_hamming", -1)])
+@pytest.mark.parametrize("size", [32, 16])
+def test_threshold_that_no_match_can_pass_is_an_error(name: str, value: float, size: int) -> None:
+    descriptors = torch.zeros(4, size, dtype=torch.uint8)
+    with pytest.raises(ConfigError, match=f"^{name} is {value}; give a .*number of at least 0$"):
+        match_descriptors(descriptors, descriptors, **{name: value})  # type: ignore[arg-type]

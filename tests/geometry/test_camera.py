@@ -11,6 +11,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia.core.exceptions import ShapeError
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import BackProjector, PinholeCamera
@@ -162,3 +163,9 @@ def test_camera_accepts_numpy_and_torch_numbers() -> None:
 def test_invalid_camera_is_rejected(change: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=f"^the camera's {message}"):
         PinholeCamera(**{"fx": 500.0, "fy": 500.0, "cx": 320.0, "cy": 240.0} | change)
+
+
+def test_error_of_the_size_of_an_image_names_depth_and_camera() -> None:
+    project = BackProjector(PinholeCamera(50.0, 50.0, 15.5, 11.5, width=32, height=24))
+    with pytest.raises(ShapeError, match=r"^depth has the shape \(1, 1, 12, 16\); .* of shape \(B, 1, 24, 32\)$"):
+        project(torch.ones(1, 1, 12, 16))

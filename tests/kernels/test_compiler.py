@@ -78,7 +78,8 @@ def test_kernel_runs_for_plain_tensors_only(double: list[str]) -> None:
     doubled(torch.ones(1, dtype=torch.float64, device="meta"))
     with torch.autograd.forward_ad.dual_level():
         doubled(torch.ones(1, dtype=torch.float64))
-    assert double == ["kernel", "torch", "torch", "torch", "torch"]
+    torch.jit.trace(doubled, torch.ones(1, dtype=torch.float64), check_trace=False)
+    assert double == ["kernel", "torch", "torch", "torch", "torch", "torch"]
     assert doubled.__doc__ == "Twice a number."
 
 

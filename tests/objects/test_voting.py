@@ -177,3 +177,39 @@ def test_module_uses_the_temperature() -> None:
         module = HoughVoting(0.1, 2, temperature)(previous, current, all_present)
         assert torch.equal(module.votes, hough_vote(previous, current, all_present, 0.1, 2, temperature).votes)
     assert not torch.equal(module.votes, hough_vote(previous, current, all_present, 0.1, 2).votes)
+
+
+def test_thresholds_of_a_batch_belong_to_its_problems() -> None:
+    """They were compared with the objects, of which there can be as many."""
+    previous = torch.rand(3, 3, 3, generator=torch.Generator().manual_seed(0))
+    current = previous + 0.1 * torch.rand(3, 3, 3, generator=torch.Generator().manual_seed(1))
+    present = torch.ones(3, 3, dtype=torch.bool)
+    thresholds = torch.tensor([0.0, 0.05, 10.0]), torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.01, 0.1, 0.2])
+    for settings_of_batch in (thresholds[:2], thresholds):
+        together = hough_vote(previous, current, present, *settings_of_batch)
+        for k in range(3):
+            numbers = (each[k] for each in settings_of_batch)
+            one = hough_vote(previous[k], current[k], present[k], *numbers)
+            assert all(torch.equal(batch[k], single) for batch, single in zip(together, one, strict=True))
+
+
+@pytest.mark.parametrize("name", ["distance_threshold", "vote_threshold", "temperature"])
+@pytest.mark.parametrize("shape", [(3,), (2, 1, 1), (2, 3)])
+def test_threshold_that_does_not_fit_the_batch_is_an_error(name: str, shape: tuple[int, ...]) -> None:
+    centroids, present = torch.zeros(2, 3, 3), torch.ones(2, 3, dtype=torch.bool)
+    arguments = {"distance_threshold": 0.1, "vote_threshold": 2, "temperature": 0.1} | {name: torch.ones(shape)}
+    with pytest.raises(ShapeError, match=f"^{name} has the shape .* of shape \\(2\\)$"):
+        hough_vote(centroids, centroids, present, **arguments)  # type: ignore[arg-type]
+
+
+def test_threshold_that_is_a_tensor_moves_with_the_module() -> None:
+    module = HoughVoting(torch.tensor(0.1), torch.tensor(2), torch.nn.Parameter(torch.tensor(0.05)))
+    assert set(module.state_dict()) == {"distance_threshold", "vote_threshold", "temperature"}
+    assert dict(module.named_parameters()).keys() == {"temperature"}
+    moved = module.to("meta")
+    assert moved.distance_threshold.is_meta and moved.vote_threshold.is_meta
+
+
+def test_text_of_the_module_has_its_settings() -> None:
+    module = HoughVoting(torch.nn.Parameter(torch.tensor(0.5)), 2)
+    assert repr(module) == "HoughVoting(distance_threshold=0.5, vote_threshold=2, temperature=None)"

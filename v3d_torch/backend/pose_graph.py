@@ -15,10 +15,11 @@ import torch
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks, check_positive
-from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
+from v3d_torch.geometry.argument_checks import check_counts, check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient, without_second_derivatives, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import adjoint, invert, left_jacobian_inverse, se3_exp, se3_log
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import pose_graph as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by
 from v3d_torch.optim.block_system import solve_block_system
@@ -79,7 +80,8 @@ def optimise_pose_graph(
     The result is differentiable in the measured poses, information, weights and fixed poses, by the implicit function
     theorem: memory does not grow with the iterations, but with the square of N. The Hessian is that of the robust cost,
     including the dependence of the robust weights on the errors. The derivatives are as accurate as the optimum: train
-    with a small ``tolerance`` and enough ``iterations``. Second derivatives are not correct.
+    with a small ``tolerance`` and enough ``iterations``. There are no second derivatives: autograd raises an
+    InputError, and those of `torch.func` are not correct.
 
     Grisetti et al., A Tutorial on Graph-Based SLAM, 2010; Gould et al., On Differentiating Parameterized Argmin and
     Argmax Problems, 2016.
@@ -91,7 +93,8 @@ def optimise_pose_graph(
             :math:`(*, E, 2)`; any indices for padding.
         T_ij: Measured pose of camera j in camera i, ``T_wi^-1 T_wj``, shape :math:`(*, E, 4, 4)`, or PyPose's SE3 of
             shape :math:`(*, E)`.
-        information: Inverse covariances of the errors, shape :math:`(*, E, 6, 6)`; None for the identity.
+        information: Inverse covariances of the errors, shape :math:`(*, E, 6, 6)`, of which the symmetric part is used;
+            None for the identity.
         fixed: Mask of the poses that stay unchanged, bool, shape :math:`(*, N)`; None for only the first. Poses that
             are padding have no edges; they must be finite, and are returned unchanged.
         weights: Weight of each edge, not negative, shape :math:`(*, E)`; None for 1.
@@ -106,12 +109,12 @@ def optimise_pose_graph(
 
     Raises:
         InputError: If ``edges`` is not int64, has an index out of range or joins a pose to itself, if a mask is not
-            bool, if a pose or an information matrix is not finite, or if a weight is negative, infinite or NaN.
-        ConfigError: If ``robust`` is not positive.
+            bool, if a pose or an information matrix is not finite, if an information matrix has a negative value on its
+            diagonal, or if a weight is negative, infinite or NaN.
+        ConfigError: If ``robust`` is not positive, or ``iterations`` is negative or not a whole number.
     """
     check_masks(fixed=fixed, valid=valid)
-    if robust is not None:
-        check_positive(robust=robust)
+    _check_settings(iterations, robust)
     initial, measured = (T.matrix() if _is_lie_tensor(T) else T for T in (T_wc, T_ij))
     batch = check_shapes(
         T_wc=(initial, "N", 4, 4),
@@ -155,6 +158,12 @@ def edge_errors(T_wi: Tensor, T_wj: Tensor, T_ji: Tensor) -> tuple[Tensor, Tenso
     return error, J_i, J_j
 
 
+def _check_settings(iterations: int, robust: float | None) -> None:
+    check_counts(iterations=iterations)
+    if robust is not None:
+        check_positive(robust=robust)
+
+
 class _Graph(NamedTuple):
     """Edges of a pose graph: measured relative poses, with the indices of both poses."""
 
@@ -191,8 +200,9 @@ class _Graph(NamedTuple):
         constant = self.detach()
         ends = constant._ends(T_wc)
         blocks = jacobian(lambda xi: constant._gradient(ends, xi), T_wc.new_zeros(*self.edges.shape[:-1], 12))
-        anchored = torch.where(self.is_fixed, initial, T_wc)
-        gradient = self._gradient(self._ends(anchored), None)
+        anchored = torch.where(self.is_fixed, without_second_derivatives(initial), T_wc)
+        graph = _Graph(*map(without_second_derivatives, self))
+        gradient = graph._gradient(graph._ends(anchored), None)
         steps = solve_block_system(blocks, gradient, self.edges, self.fixed, 0.0, REGULARISATION)
         return zero_with_gradient(steps)
 
@@ -265,6 +275,9 @@ def _prepare(
         T_ij = torch.where(valid[..., None, None], T_ij, identity[:4, :4])
         information = torch.where(valid[..., None, None], information, identity)
     check_finite_arguments(T_wc=T_wc, T_ij=T_ij, information=information)
+    if can_read(information) and bool((information.diagonal(dim1=-2, dim2=-1) < 0).any()):
+        raise InputError("information has a negative value on a diagonal; give inverse covariances")
+    information = (information + information.mT) / 2  # a skew part has no influence on the cost, but on its gradient
     graph = _Graph(
         edges=edges.expand(*batch, count, 2),
         T_ji=invert(T_ij).expand(*batch, count, 4, 4),
@@ -294,16 +307,20 @@ def _move(initial: Tensor, optimum: Tensor, steps: Tensor | None, is_fixed: Tens
     return torch.where(is_fixed, initial.to(dtype), T.to(dtype))
 
 
-class PoseGraphOptimiser(torch.nn.Module):
+class PoseGraphOptimiser(SettingsModule):
     """:func:`optimise_pose_graph` as a module.
 
     Args:
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
         robust: Error, in standard deviations, above which Huber's loss grows linearly; None for plain least squares.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`optimise_pose_graph`.
     """
 
     def __init__(self, iterations: int = 50, tolerance: float = 1e-6, robust: float | None = None) -> None:
+        _check_settings(iterations, robust)
         super().__init__()
         self.iterations = iterations
         self.tolerance = tolerance

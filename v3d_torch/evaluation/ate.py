@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.evaluation.umeyama import nearest_rotation, umeyama, weighted_mean
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import check_masks, check_not_jit_traced
 from v3d_torch.geometry.finite_matrices import zero_if_not_finite
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.precision import result_dtype
@@ -80,8 +80,9 @@ def ate(T_gc: Tensor, T_ec: Tensor, valid: Tensor | None = None) -> Tensor:
         pose is not finite.
 
     Raises:
-        InputError: If ``valid`` is not bool.
+        InputError: If ``valid`` is not bool, or in `torch.jit.trace`.
     """
+    check_not_jit_traced("ate")
     check_masks(valid=valid)
     check_shapes(T_gc=(T_gc, "N", 4, 4), T_ec=(T_ec, "N", 4, 4), valid=(valid, "N"))
     each = None if valid is None else valid[..., None, None]

@@ -14,6 +14,7 @@ from v3d_torch.evaluation.statistics import Statistics
 from v3d_torch.geometry.argument_checks import check_masks, check_positive
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import invert, se3_log
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels.compiler import can_read
 from v3d_torch.runtime.batches import check_shapes, mask_or_all
 from v3d_torch.types import Trajectory
@@ -213,14 +214,18 @@ def relative_errors(T_gi: Tensor, T_gj: Tensor, T_ei: Tensor, T_ej: Tensor) -> t
     return E[..., :3, 3].norm(dim=-1), torch.rad2deg(se3_log(E)[..., 3:].norm(dim=-1))
 
 
-class RelativePoseError(torch.nn.Module):
+class RelativePoseError(SettingsModule):
     """:func:`rpe` as a module.
 
     Args:
         delta: Time between the poses of a pair, seconds.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`rpe`.
     """
 
     def __init__(self, delta: float = 1.0) -> None:
+        check_positive(delta=delta)
         super().__init__()
         self.delta = delta
 

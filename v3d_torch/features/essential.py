@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
+from v3d_torch.features.sampling import ITERATIONS, check_limits, find_best_hypothesis, gather_samples
 from v3d_torch.features.sampson import EpipolarProblem, compose, decompose, refine_essential
 from v3d_torch.features.usac import usac_options
-from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels.compiler import can_read, to_array
 from v3d_torch.runtime.batches import check_shapes, fill_padding, fill_weights, mask_or_all
 
@@ -54,10 +55,12 @@ def essential_ransac(
     """Estimate essential matrices from pairs of pixels: RANSAC, refined by the Sampson distance of all inliers.
 
     The matrices are differentiable in pixels, camera matrix and weights, by the implicit function theorem; the inliers
-    are constant. On the CPU, OpenCV computes the hypotheses by the five-point algorithm, one problem of the batch
+    are constant. There are no second derivatives: autograd raises an InputError, and those of `torch.func` are not
+    correct. On the CPU, OpenCV computes the hypotheses by the five-point algorithm, one problem of the batch
     after the other. On other devices, and if `torch.func` traces the computation, torch computes them for the whole
     batch at once by the eight-point algorithm, which fails if all points lie in a plane.
 
+    If the camera did not move, or only turned, each matrix of some family fits all pairs, and one of them is returned.
     `kornia.geometry.motion_from_essential_choose_solution` gives the motion, up to the length of its translation.
 
     Nister, An Efficient Solution to the Five-Point Relative Pose Problem, PAMI 2004; Hartley and Zisserman, Multiple
@@ -80,10 +83,10 @@ def essential_ransac(
 
     Raises:
         InputError: If ``valid`` is not bool, or a weight is negative, infinite or NaN.
-        ConfigError: If ``threshold`` or ``iterations`` is not positive.
+        ConfigError: If ``threshold`` or ``iterations`` is not positive, or ``iterations`` is not a whole number.
     """
     check_masks(valid=valid)
-    check_positive(threshold=threshold, iterations=iterations)
+    check_limits(threshold, iterations)
     batch = check_shapes(
         uv_a=(uv_a, "N", 2), uv_b=(uv_b, "N", 2), K=(K, 3, 3), weights=(weights, "N"), valid=(valid, "N")
     )
@@ -161,16 +164,20 @@ def _homogeneous(uv: Tensor) -> Tensor:
     return torch.cat([uv, torch.ones_like(uv[..., :1])], dim=-1)
 
 
-class EssentialRANSAC(torch.nn.Module):
+class EssentialRANSAC(SettingsModule):
     """:func:`essential_ransac` as a module.
 
     Args:
         threshold: Maximum Sampson distance of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`essential_ransac`.
     """
 
     def __init__(self, threshold: float = 1.0, iterations: int = ITERATIONS, seed: int = 0) -> None:
+        check_limits(threshold, iterations)
         super().__init__()
         self.threshold = threshold
         self.iterations = iterations

@@ -9,8 +9,15 @@ from torch import Tensor
 
 from v3d_torch.config import OdometryConfig
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks
+from v3d_torch.geometry.argument_checks import (
+    check_counts,
+    check_masks,
+    check_not_jit_traced,
+    check_not_negative,
+    is_count,
+)
 from v3d_torch.geometry.precision import without_autocast
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import descriptors as descriptor_kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.runtime.batches import check_shapes, common_batch
@@ -54,6 +61,8 @@ def _match_descriptors_compiled(
     max_hamming: int = MAX_HAMMING,
     max_ratio: float = MAX_RATIO,
 ) -> Tensor:
+    if not is_count(max_hamming) or not max_ratio >= 0:
+        return NotImplemented
     if any(each.dtype != torch.uint8 or each.ndim < 2 or each.shape[-1] != _BYTES for each in (a, b)):
         return NotImplemented
     if any(valid is not None and valid.dtype != torch.bool for valid in (a_valid, b_valid)):
@@ -108,8 +117,11 @@ def match_descriptors(
         ``a`` or ``b`` has fewer than two descriptors.
 
     Raises:
-        InputError: If a mask is not bool, or descriptors are not uint8.
+        InputError: If a mask is not bool, if descriptors are not uint8, or in `torch.jit.trace`.
+        ConfigError: If a threshold is negative or NaN, or ``max_hamming`` is not a whole number.
     """
+    check_not_jit_traced("match_descriptors")
+    _check_thresholds(max_hamming, max_ratio)
     check_masks(a_valid=a_valid, b_valid=b_valid)
     for name, descriptors in (("a", a), ("b", b)):
         if descriptors.dtype != torch.uint8:
@@ -134,6 +146,11 @@ def match_descriptors(
     return torch.where(accepted, nearest, -1)
 
 
+def _check_thresholds(max_hamming: int, max_ratio: float) -> None:
+    check_counts(max_hamming=max_hamming)
+    check_not_negative(max_ratio=max_ratio)
+
+
 @without_autocast
 def _pairwise_hamming_distances(a: Tensor, b: Tensor) -> Tensor:
     """Hamming distances of all pairs of descriptors (..., N, D) and (..., M, D), float32, (..., N, M).
@@ -146,15 +163,19 @@ def _pairwise_hamming_distances(a: Tensor, b: Tensor) -> Tensor:
     return (8 * a.shape[-1] - signs[0] @ signs[1].mT) / 2
 
 
-class DescriptorMatcher(torch.nn.Module):
+class DescriptorMatcher(SettingsModule):
     """:func:`match_descriptors` as a module.
 
     Args:
         max_hamming: Maximum Hamming distance, bits.
         max_ratio: The best distance is less than this fraction of the second-best.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`match_descriptors`.
     """
 
     def __init__(self, max_hamming: int = MAX_HAMMING, max_ratio: float = MAX_RATIO) -> None:
+        _check_thresholds(max_hamming, max_ratio)
         super().__init__()
         self.max_hamming = max_hamming
         self.max_ratio = max_ratio

@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from v3d_torch.features.p3p import solve_p3p
-from v3d_torch.features.sampling import ITERATIONS, find_best_hypothesis, gather_samples
+from v3d_torch.features.sampling import ITERATIONS, check_limits, find_best_hypothesis, gather_samples
 from v3d_torch.features.usac import usac_options
-from v3d_torch.geometry.argument_checks import check_masks, check_positive
+from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.precision import result_dtype
 from v3d_torch.geometry.se3 import orthonormalise, transform_points
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels.compiler import can_read, is_all_true, to_array
 from v3d_torch.optim.levenberg_marquardt import select
 from v3d_torch.optim.pose_refinement import refine_pose
@@ -64,7 +65,7 @@ def pnp_ransac(
     Args:
         points: Points in a frame "w", metres, floating point, shape :math:`(*, N, 3)`.
         uv: Undistorted pixels of the points, shape :math:`(*, N, 2)`.
-        K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
+        K: Camera matrix, shape :math:`(*, 3, 3)`; its skew is ignored.
         initial_guess: Predicted ``T_cw``, shape :math:`(*, 4, 4)`; None, or NaN in a batch, if there is no prediction.
             If the refined prediction explains more than half of the points, RANSAC is skipped.
         valid: Mask of the points that are not padding, bool, shape :math:`(*, N)`; None for all. A point that is not
@@ -77,11 +78,12 @@ def pnp_ransac(
         Poses with the dtype of ``points``, float32 for integers. No pose is found from fewer than 6 points.
 
     Raises:
-        InputError: If ``valid`` is not bool.
-        ConfigError: If ``threshold`` or ``iterations`` is not positive.
+        InputError: If ``valid`` is not bool, or if ``K`` can be read at once and is not that of a pinhole camera, see
+            :func:`refine_pose`.
+        ConfigError: If ``threshold`` or ``iterations`` is not positive, or ``iterations`` is not a whole number.
     """
     check_masks(valid=valid)
-    check_positive(threshold=threshold, iterations=iterations)
+    check_limits(threshold, iterations)
     batch = check_shapes(
         points=(points, "N", 3), uv=(uv, "N", 2), K=(K, 3, 3), initial_guess=(initial_guess, 4, 4), valid=(valid, "N")
     )
@@ -181,16 +183,20 @@ def _sample_torch(
     )
 
 
-class PnPRANSAC(torch.nn.Module):
+class PnPRANSAC(SettingsModule):
     """:func:`pnp_ransac` as a module.
 
     Args:
         threshold: Maximum reprojection error of an inlier, pixels.
         iterations: Maximum number of hypotheses.
         seed: Seed of the sampling.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`pnp_ransac`.
     """
 
     def __init__(self, threshold: float = 4.0, iterations: int = ITERATIONS, seed: int = 0) -> None:
+        check_limits(threshold, iterations)
         super().__init__()
         self.threshold = threshold
         self.iterations = iterations

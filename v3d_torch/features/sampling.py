@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import OdometryConfig
+from v3d_torch.geometry.argument_checks import check_counts, check_positive
 
 ITERATIONS = OdometryConfig().iterations
 """Default number of hypotheses, that of the odometry section of the configuration."""
@@ -94,6 +95,20 @@ def _random_bits(count: int, seed: int, device: torch.device) -> Tensor:
         bits = (bits & mask) ^ ((bits & mask) >> shift)
         bits = bits * factor & mask
     return bits ^ (bits >> 15)
+
+
+def check_limits(threshold: float, iterations: int) -> None:
+    """Check the limits of a search.
+
+    Args:
+        threshold: Maximum error of an inlier.
+        iterations: Maximum number of hypotheses.
+
+    Raises:
+        ConfigError: If one of them is not positive, or ``iterations`` is not a whole number.
+    """
+    check_positive(threshold=threshold, iterations=iterations)
+    check_counts(iterations=iterations)
 
 
 def gather_samples(elements: Tensor, samples: Tensor) -> Tensor:

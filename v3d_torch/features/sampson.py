@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.gradients import zero_with_gradient
+from v3d_torch.geometry.gradients import without_second_derivatives, zero_with_gradient
 from v3d_torch.geometry.se3 import hat, se3_exp
 from v3d_torch.kernels import sampson as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
@@ -109,7 +109,8 @@ class EpipolarProblem(NamedTuple):
         constant = EpipolarProblem(*(each.detach() for each in self))
         zero = state[0].new_zeros(*state[0].shape[:-2], 5)
         H = _regularise(jacobian(lambda x: gradient(x, constant), zero))
-        return _move(state, zero_with_gradient(-torch.linalg.solve(H, gradient(zero, self))))
+        problem = EpipolarProblem(*map(without_second_derivatives, self))
+        return _move(state, zero_with_gradient(-torch.linalg.solve(H, gradient(zero, problem))))
 
 
 def _length(line_a: Tensor, line_b: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import torch
 from kornia.core.exceptions import ShapeError
 from torch import Tensor
@@ -73,3 +75,35 @@ def check_not_negative(**numbers: Tensor | float) -> None:
     for name, number in numbers.items():
         if not isinstance(number, Tensor) and not number >= 0:
             raise ConfigError(f"{name} is {number}; give a number of at least 0")
+
+
+def is_count(number: object) -> bool:
+    """Check whether a number is whole and at least 0. A kernel would cut off the decimals of a float."""
+    return isinstance(number, Integral) and int(number) >= 0
+
+
+def check_counts(**numbers: float) -> None:
+    """Check that parameters are whole numbers of at least 0.
+
+    Args:
+        numbers: Parameters by the name of the argument.
+
+    Raises:
+        ConfigError: If a number is negative, or of a type with decimals, such as float.
+    """
+    for name, number in numbers.items():
+        if not is_count(number):
+            raise ConfigError(f"{name} is {number}; give a whole number of at least 0")
+
+
+def check_not_jit_traced(function: str) -> None:
+    """Check that `torch.jit.trace` does not record a function whose steps depend on sizes or values.
+
+    Args:
+        function: Name of the function.
+
+    Raises:
+        InputError: If it does.
+    """
+    if torch.jit.is_tracing():  # type: ignore[attr-defined]  # its type stub lacks it
+        raise InputError(f"torch.jit.trace cannot record {function}; use torch.export.export")

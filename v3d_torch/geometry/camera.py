@@ -132,7 +132,10 @@ class PinholeCamera:
     @cached_property
     @torch.inference_mode(False)
     def focal_lengths(self) -> Tensor:
-        """Focal lengths along u and v, pixels, float64, shape :math:`(2,)`."""
+        """Focal lengths along u and v, pixels, float64, shape :math:`(2,)`.
+
+        The property returns the same tensor each time; clone it before you change it.
+        """
         return torch.tensor([self.fx, self.fy], dtype=torch.float64)
 
     @cached_property
@@ -295,7 +298,10 @@ class PinholeCamera:
     @cached_property
     @torch.inference_mode(False)
     def rays(self) -> Tensor:
-        """Viewing ray of every pixel of the recorded image at unit depth, float32, shape :math:`(H, W, 3)`."""
+        """Viewing ray of every pixel of the recorded image at unit depth, float32, shape :math:`(H, W, 3)`.
+
+        The property returns the same tensor each time; clone it before you change it.
+        """
         v, u = torch.meshgrid(
             torch.arange(self.height, dtype=torch.float64),
             torch.arange(self.width, dtype=torch.float64),
@@ -335,5 +341,10 @@ class BackProjector(torch.nn.Module):
         self._camera = camera
 
     def forward(self, depth: Tensor) -> Tensor:
-        """Back-project depth images, metres, shape :math:`(B, 1, H, W)`; see :func:`back_project`."""
+        """Back-project depth images, metres, shape :math:`(B, 1, H, W)`; see :func:`back_project`.
+
+        Raises:
+            ShapeError: If the images do not have the size of the camera.
+        """
+        check_shape("depth", depth, "B", 1, self._camera.height, self._camera.width)
         return back_project(depth, self._camera.rays)

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_not_negative, check_positive, check_shape
+from v3d_torch.geometry.argument_checks import check_not_negative, check_positive, check_shape, is_count
 from v3d_torch.geometry.precision import result_dtype, working_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import depth_smoother as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
@@ -23,7 +24,7 @@ _STRIP_HEIGHT = 120
 
 def _smooth_depth_compiled(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> Tensor:
     is_image = depth.dtype == torch.float32 and depth.ndim == 4 and depth.shape[1] == 1
-    if not is_image or kernel_size < 1 or kernel_size % 2 == 0 or not sigma > 0 or not edge_ratio >= 0:
+    if not is_image or not _has_centre(kernel_size) or not sigma > 0 or not edge_ratio >= 0:
         return NotImplemented
     taps = np.array(_gaussian(kernel_size, sigma), np.float32)
     limits = np.float32(edge_ratio), np.float32(_MAX_VALID_DEPTH)
@@ -62,11 +63,8 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
     Raises:
         ConfigError: If the window has no centre pixel, ``sigma`` is not positive, or ``edge_ratio`` is negative or NaN.
     """
-    check_positive(sigma=sigma)
-    check_not_negative(edge_ratio=edge_ratio)
+    _check_settings(kernel_size, sigma, edge_ratio)
     check_shape("depth", depth, "B", 1, "H", "W")
-    if kernel_size < 1 or kernel_size % 2 == 0:
-        raise ConfigError(f"kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
     radius = kernel_size // 2
     taps, height = _gaussian(kernel_size, sigma), depth.shape[-2]
     wide = depth.to(working_dtype(depth.dtype))  # half precision cannot represent the placeholder
@@ -76,6 +74,17 @@ def smooth_depth(depth: Tensor, kernel_size: int = 5, sigma: float = 1.0, edge_r
         rows = slice(top - margin, min(top + _STRIP_HEIGHT + radius, height))
         strips.append(_smooth(wide[..., rows, :], taps, edge_ratio)[..., margin : margin + _STRIP_HEIGHT, :])
     return torch.cat(strips, dim=-2).to(result_dtype(depth.dtype))
+
+
+def _check_settings(kernel_size: int, sigma: float, edge_ratio: float) -> None:
+    check_positive(sigma=sigma)
+    check_not_negative(edge_ratio=edge_ratio)
+    if not _has_centre(kernel_size):
+        raise ConfigError(f"kernel_size is {kernel_size}; give an odd number of pixels, such as 3 or 5")
+
+
+def _has_centre(kernel_size: int) -> bool:
+    return is_count(kernel_size) and kernel_size % 2 == 1
 
 
 def _gaussian(kernel_size: int, sigma: float) -> tuple[float, ...]:
@@ -131,16 +140,20 @@ def _convolve(
     return sums, weights
 
 
-class DepthSmoother(torch.nn.Module):
+class DepthSmoother(SettingsModule):
     """Depth re-estimation as a module; see :func:`smooth_depth`.
 
     Args:
         kernel_size: Side of the window, pixels, odd.
         sigma: Standard deviation of the Gaussian, pixels.
         edge_ratio: Largest accepted difference from the centre's depth, as a fraction of the centre's depth.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`smooth_depth`.
     """
 
     def __init__(self, kernel_size: int = 5, sigma: float = 1.0, edge_ratio: float = 0.05) -> None:
+        _check_settings(kernel_size, sigma, edge_ratio)
         super().__init__()
         self.kernel_size = kernel_size
         self.sigma = sigma

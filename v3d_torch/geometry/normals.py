@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_not_negative, check_shape
+from v3d_torch.geometry.argument_checks import check_counts, check_not_negative, check_shape, is_count
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.kernels import normals as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -21,7 +21,9 @@ _EDGE_RATIO = 0.05
 
 
 def _surface_normals_compiled(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _EDGE_RATIO) -> Tensor:
-    if points.dtype != torch.float32 or points.ndim != 4 or points.shape[3] != 3 or radius < 0 or not edge_ratio >= 0:
+    if points.dtype != torch.float32 or points.ndim != 4 or points.shape[3] != 3:
+        return NotImplemented
+    if not is_count(radius) or not edge_ratio >= 0:
         return NotImplemented
     normals = torch.zeros(points.shape, dtype=points.dtype)  # contiguous, even if the points are not
     for image, result in zip(to_array(points), normals.numpy(), strict=True):
@@ -48,11 +50,12 @@ def surface_normals(points: Tensor, radius: int = _RADIUS, edge_ratio: float = _
         and its four neighbours are measured and lie on one surface.
 
     Raises:
-        ConfigError: If ``radius`` is negative, or ``edge_ratio`` is negative or NaN.
+        ConfigError: If ``radius`` is negative or not a whole number, or ``edge_ratio`` is negative or NaN.
     """
     check_not_negative(edge_ratio=edge_ratio)
     if radius < 0:
         raise ConfigError(f"radius is {radius}; give a number of pixels of at least 0")
+    check_counts(radius=radius)
     check_shape("points", points, "B", "H", "W", 3)
     dtype, points = result_dtype(points.dtype), points.to(working_dtype(points.dtype))
     z = points[..., 2]

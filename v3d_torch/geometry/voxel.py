@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_masks, check_positive, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import voxel as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
@@ -135,14 +136,18 @@ def _number_voxels(points: Tensor, valid: Tensor, size: float) -> tuple[Tensor, 
     return torch.zeros_like(order).scatter(1, order, rank), begins.sum(dim=1)
 
 
-class VoxelPool(torch.nn.Module):
+class VoxelPool(SettingsModule):
     """Voxel pooling as a module; see :func:`voxel_pool`.
 
     Args:
         size: Side of a voxel, metres.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`voxel_pool`.
     """
 
     def __init__(self, size: float) -> None:
+        check_positive(size=size)
         super().__init__()
         self.size = size
 

@@ -215,8 +215,9 @@ def is_transformed() -> bool:
 
 
 def _is_traced() -> bool:
-    """Check whether a compiler traces the computation, or a transform does."""
-    return torch.compiler.is_compiling() or is_transformed()
+    """Check whether a compiler or `torch.jit.trace` traces the computation, or a transform does."""
+    is_recorded = torch.jit.is_tracing()  # type: ignore[attr-defined]  # its type stub lacks it
+    return torch.compiler.is_compiling() or is_recorded or is_transformed()
 
 
 def _is_plain(argument: object) -> bool:

@@ -17,8 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.geometry.argument_checks import check_counts, check_positive
 from v3d_torch.geometry.gradients import needs_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.bundle_problem import BundleProblem, prepare_bundle
@@ -85,7 +87,8 @@ def bundle_adjust(
     The result is differentiable in all inputs except the initial poses and points, by the implicit function theorem:
     memory does not grow with the iterations. The Hessian is that of the robust cost, including the dependence of the
     robust weights on the residuals. The result is also differentiable in fixed poses. The derivatives are as accurate
-    as the optimum: train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not correct.
+    as the optimum: train with a small ``tolerance`` and enough ``iterations``. There are no second derivatives:
+    autograd raises an InputError, and those of `torch.func` are not correct.
 
     Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000; Gould et al., On Differentiating Parameterized Argmin
     and Argmax Problems, 2016.
@@ -99,7 +102,7 @@ def bundle_adjust(
         pose: Index of the pose from which each observation was made, from 0 to P - 1, int64, shape :math:`(*, M)`;
             any index for padding.
         point: Index of the observed landmark, from 0 to L - 1, int64, shape :math:`(*, M)`; any index for padding.
-        K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
+        K: Camera matrix, shape :math:`(*, 3, 3)`; its skew is ignored.
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, M)`; 0, NaN or infinite = not measured.
             None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, M)`.
@@ -118,9 +121,13 @@ def bundle_adjust(
 
     Raises:
         InputError: If ``pose`` or ``point`` is not int64 or has an index out of range, if a mask is not bool, if a pose
-            or landmark is not finite, or if a weight is negative, infinite or NaN.
-        ConfigError: If a standard deviation that is a number is not positive.
+            or landmark is not finite, if a weight is negative, infinite or NaN, if a standard deviation in a tensor is
+            not positive, or if ``K`` is not finite, or has a focal length that is not positive or a last row other than
+            (0, 0, 1). Values are checked only if they can be read at once.
+        ConfigError: If a standard deviation that is a number is not positive, or ``iterations`` is negative or not a
+            whole number.
     """
+    check_counts(iterations=iterations)
     problem, initial, valid = prepare_bundle(
         T_cw, points, uv, pose, point, K, inverse_depth, pixel_sigma, inverse_depth_sigma, fixed, weights, valid
     )
@@ -191,7 +198,7 @@ def _minimise(T_cw: Tensor, points: Tensor, *columns: Tensor, iterations: int, t
     return _Minimum(*found.state, problem.chi2(found.system), found.cost_before, found.cost_after, found.iterations)
 
 
-class BundleAdjuster(torch.nn.Module):
+class BundleAdjuster(SettingsModule):
     """:func:`bundle_adjust` as a module. Standard deviations that are a `torch.nn.Parameter` can be learned.
 
     Args:
@@ -199,6 +206,9 @@ class BundleAdjuster(torch.nn.Module):
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m.
         iterations: Maximum number of Levenberg-Marquardt steps.
         tolerance: Relative change of the cost that ends the optimisation.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`bundle_adjust`.
     """
 
     def __init__(
@@ -209,6 +219,8 @@ class BundleAdjuster(torch.nn.Module):
         iterations: int = 10,
         tolerance: float = 1e-6,
     ) -> None:
+        check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
+        check_counts(iterations=iterations)
         super().__init__()
         self.pixel_sigma = pixel_sigma
         self.inverse_depth_sigma = inverse_depth_sigma

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.geometry.argument_checks import check_masks
-from v3d_torch.geometry.gradients import zero_with_gradient
+from v3d_torch.geometry.gradients import without_second_derivatives, zero_with_gradient
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.compiler import can_read
 from v3d_torch.optim.implicit import jacobian
@@ -26,7 +26,13 @@ from v3d_torch.optim.reprojection import (
     whiten,
 )
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
-from v3d_torch.runtime.batches import check_finite_arguments, check_shapes, fill_indices, fill_weights
+from v3d_torch.runtime.batches import (
+    check_camera_matrix,
+    check_finite_arguments,
+    check_shapes,
+    fill_indices,
+    fill_weights,
+)
 
 NEGLIGIBLE_DAMPING = 1e-9
 """Damping of a full Gauss-Newton step, negligible relative to the diagonal."""
@@ -136,7 +142,8 @@ class BundleProblem(NamedTuple):
 
         blocks = jacobian(gradient, T.new_zeros(*X.shape[:-2], X.shape[-1], 9)).movedim(-3, -1)
         anchored = torch.where(self.fixed[..., None, None], T_cw, state[0])
-        right = self._gradient(*self._gather((anchored, state[1])))
+        problem = BundleProblem(*map(without_second_derivatives, self))
+        right = problem._gradient(*problem._gather((without_second_derivatives(anchored), state[1])))
         steps = solve_normal_equations(self._assemble(blocks, right, state[1].shape[-2]), 0.0)
         return self._move((anchored, state[1]), (zero_with_gradient(steps[0]), zero_with_gradient(steps[1])))
 
@@ -218,8 +225,9 @@ def prepare_bundle(
         shape :math:`(..., M)`.
 
     Raises:
-        InputError: If a mask is not bool, an index is not int64 or out of range, a pose or point is not finite, or a
-            weight is negative, infinite or NaN.
+        InputError: If a mask is not bool, an index is not int64 or out of range, a pose or point is not finite, a
+            weight is negative, infinite or NaN, a standard deviation in a tensor is not positive, or a camera matrix is
+            not that of a pinhole camera.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     check_masks(fixed=fixed, valid=valid)
@@ -238,6 +246,7 @@ def prepare_bundle(
         valid=(valid, "M"),
     )
     check_finite_arguments(T_cw=T_cw, points=points)
+    check_camera_matrix(K)
     finite = uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from v3d_torch.errors import InputError
+from v3d_torch.geometry.argument_checks import check_positive
 from v3d_torch.geometry.camera import MAX_READOUT
 from v3d_torch.geometry.precision import result_dtype, working_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import bundle_adjustment as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by
 from v3d_torch.mapping.bundle_adjustment import sort_by_point
@@ -92,8 +94,9 @@ def estimate_readout(
 
     Raises:
         InputError: If ``pose`` or ``point`` is not int64, or has an index out of range, if a mask is not bool, if a
-            pose or landmark is not finite, if a weight is negative, infinite or NaN, or if ``information`` is negative
-            or NaN.
+            pose or landmark is not finite, if a weight is negative, infinite or NaN, if a standard deviation in a
+            tensor is not positive, if ``K`` is not the matrix of a pinhole camera, or if ``information`` is negative or
+            NaN.
         ConfigError: If a standard deviation that is a number is not positive.
     """
     old_information = torch.as_tensor(information, dtype=torch.float64, device=uv.device)
@@ -187,17 +190,21 @@ def reduced_cost_derivatives(
     return (weighted * residuals.whitened).sum(dim=(-2, -1)), (weighted * derivative).sum(dim=(-2, -1))
 
 
-class ReadoutEstimator(torch.nn.Module):
+class ReadoutEstimator(SettingsModule):
     """:func:`estimate_readout` as a module. Standard deviations that are a `torch.nn.Parameter` can be learned.
 
     Args:
         pixel_sigma: Standard deviation of u and of v, pixels.
         inverse_depth_sigma: Standard deviation of inverse depth, 1/m.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`estimate_readout`.
     """
 
     def __init__(
         self, pixel_sigma: Tensor | float = 1.0, inverse_depth_sigma: Tensor | float = INVERSE_DEPTH_SIGMA
     ) -> None:
+        check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
         super().__init__()
         self.pixel_sigma = pixel_sigma
         self.inverse_depth_sigma = inverse_depth_sigma

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.errors import ConfigError, InputError
-from v3d_torch.geometry.argument_checks import check_masks, check_shape
+from v3d_torch.geometry.argument_checks import (
+    check_counts,
+    check_masks,
+    check_not_jit_traced,
+    check_shape,
+    is_count,
+)
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import dbscan as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by, to_array
 
@@ -36,7 +43,9 @@ Pairs = tuple[Ints, Ints]
 
 
 def _dbscan_compiled(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
-    if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape or not eps > 0 or min_samples < 1:
+    if points.ndim != 3 or points.shape[2] != 3 or points.shape[:2] != valid.shape:
+        return NotImplemented
+    if not eps > 0 or not is_count(min_samples) or min_samples < 1:
         return NotImplemented
     if points.dtype not in (torch.float32, torch.float64) or valid.dtype != torch.bool:
         return NotImplemented
@@ -74,16 +83,14 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
         :math:`N^2` and time with :math:`N^3 \log N`.
 
     Raises:
-        ConfigError: If ``eps`` or ``min_samples`` is not positive.
-        InputError: If a valid point is not finite, or ``valid`` is not bool.
+        ConfigError: If ``eps`` or ``min_samples`` is not positive, or ``min_samples`` is not a whole number.
+        InputError: If a valid point is not finite, if ``valid`` is not bool, or in `torch.jit.trace`.
     """
+    check_not_jit_traced("dbscan")
     check_masks(valid=valid)
     check_shape("points", points, "B", "N", 3)
     check_shape("valid", valid, *points.shape[:2])
-    if not eps > 0 or min_samples < 1:  # also if eps is NaN
-        raise ConfigError(
-            f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"
-        )
+    _check_settings(eps, min_samples)
     if not can_read(points):
         return _cluster_densely(points.detach(), valid, eps, min_samples)
     mask = valid.numpy()
@@ -95,6 +102,14 @@ def dbscan(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tenso
     labels = np.full(mask.size, -1)
     labels[index] = np.concatenate([_cluster(cloud, eps, min_samples) for cloud in clouds])
     return torch.from_numpy(labels.reshape(mask.shape))
+
+
+def _check_settings(eps: float, min_samples: int) -> None:
+    if not eps > 0 or min_samples < 1:  # also if eps is NaN
+        raise ConfigError(
+            f"dbscan: eps is {eps} and min_samples is {min_samples}; give eps above 0 and min_samples of at least 1"
+        )
+    check_counts(min_samples=min_samples)
 
 
 def _cluster_densely(points: Tensor, valid: Tensor, eps: float, min_samples: int) -> Tensor:
@@ -202,15 +217,19 @@ def _join(component: Ints, a: Ints, b: Ints) -> Ints:
     return component
 
 
-class DBSCAN(torch.nn.Module):
+class DBSCAN(SettingsModule):
     """:func:`dbscan` as a module.
 
     Args:
         eps: Radius of a neighbourhood, metres.
         min_samples: Minimum number of points in the neighbourhood of a core point, itself included.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`dbscan`.
     """
 
     def __init__(self, eps: float, min_samples: int) -> None:
+        _check_settings(eps, min_samples)
         super().__init__()
         self.eps = eps
         self.min_samples = min_samples

@@ -87,7 +87,10 @@ class InstanceTracker(torch.nn.Module):
         self._unregistered_since: float | None = None  # the world frame of the detections since then is a guess
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return the tracks and the next id, for ``state_dict()``."""
+        """Return the tracks and the next id, for ``state_dict()``.
+
+        The tracks are those of the tracker, not copies: copy or save the state before the next frame changes them.
+        """
         return {
             "tracks": list(self.tracks),
             "resting": list(self.resting),

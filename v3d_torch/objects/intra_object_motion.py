@@ -10,6 +10,7 @@ from torch import Tensor
 from v3d_torch.geometry.argument_checks import check_masks, check_not_negative, check_shape
 from v3d_torch.geometry.precision import result_dtype, without_autocast, working_dtype
 from v3d_torch.geometry.se3 import transform_points
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.objects.chamfer import chamfer_distance
 
 
@@ -82,14 +83,18 @@ def _transform(T: Tensor, points: Tensor, valid: Tensor | None) -> Tensor:
     return transform_points(T, points)
 
 
-class IntraObjectMotion(torch.nn.Module):
+class IntraObjectMotion(SettingsModule):
     """:func:`intra_object_motion` as a module.
 
     Args:
         distance_threshold: Minimum distance of a deforming object, metres.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`intra_object_motion`.
     """
 
     def __init__(self, distance_threshold: float) -> None:
+        check_not_negative(distance_threshold=distance_threshold)
         super().__init__()
         self.distance_threshold = distance_threshold
 

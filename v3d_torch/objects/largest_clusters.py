@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from v3d_torch.errors import InputError
-from v3d_torch.geometry.argument_checks import check_masks, check_shape
+from v3d_torch.geometry.argument_checks import check_counts, check_masks, check_shape
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels.compiler import can_read
 
 
@@ -28,7 +29,11 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
 
     Raises:
         InputError: If ``valid`` is not bool, or ``labels`` are not int64.
+        ConfigError: If ``n`` or ``min_points`` is a number that is negative or not whole.
     """
+    if not isinstance(n, Tensor):
+        check_counts(n=n)
+    check_counts(min_points=min_points)
     check_masks(valid=valid)
     if labels.dtype != torch.int64:
         raise InputError(f"labels has the type {labels.dtype}; give labels of type torch.int64")
@@ -48,14 +53,18 @@ def largest_clusters(labels: Tensor, valid: Tensor, n: int | Tensor = 1, min_poi
     return clustered & selected.gather(1, cluster)
 
 
-class LargestClusters(torch.nn.Module):
+class LargestClusters(SettingsModule):
     """:func:`largest_clusters` as a module.
 
     Args:
         min_points: Minimum number of points of a cluster that is kept.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`largest_clusters`.
     """
 
     def __init__(self, min_points: int = 1) -> None:
+        check_counts(min_points=min_points)
         super().__init__()
         self.min_points = min_points
 

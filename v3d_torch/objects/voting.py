@@ -9,8 +9,9 @@ from torch import Tensor
 
 from v3d_torch.config import VotingConfig
 from v3d_torch.errors import ConfigError
-from v3d_torch.geometry.argument_checks import check_masks, check_not_negative
+from v3d_torch.geometry.argument_checks import check_masks, check_not_negative, check_shape
 from v3d_torch.geometry.precision import result_dtype, working_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.runtime.batches import check_shapes
 
 _STATIC_VOTER_RATIO = 0.5
@@ -56,25 +57,27 @@ def hough_vote(
         current: Centroids at the current time, metres, dtype and shape of ``previous``.
         present: Mask of the objects that are observed at both times, bool, shape :math:`(..., K)`; the centroids of all
             others are ignored.
-        distance_threshold: Minimum change of a distance that counts as a vote, :math:`T_d`, metres.
-        vote_threshold: Minimum number of votes of a dynamic object, :math:`T_v`.
-        temperature: Width of a soft vote, metres: the indicator is the differentiable function
-            :math:`\sigma((change - T_d) / temperature)`. None for the step function of the paper.
+        distance_threshold: Minimum change of a distance that counts as a vote, :math:`T_d`, metres, a number or shape
+            :math:`(...)`.
+        vote_threshold: Minimum number of votes of a dynamic object, :math:`T_v`, a number or shape :math:`(...)`.
+        temperature: Width of a soft vote, metres, a number or shape :math:`(...)`: the indicator is the differentiable
+            function :math:`\sigma((change - T_d) / temperature)`. None for the step function of the paper.
 
     Returns:
         Votes. ``change`` is differentiable in both inputs of centroids. With a temperature, ``pair`` and ``votes`` are
-        differentiable in centroids, and in thresholds and temperature if these are tensors.
+        differentiable in centroids, and in ``distance_threshold`` and ``temperature`` if these are tensors.
 
     Raises:
         InputError: If ``present`` is not bool.
         ConfigError: If ``temperature`` is a number that is not positive, or a threshold is a number that is negative or
             NaN.
+        ShapeError: If a threshold or ``temperature`` is a tensor of another shape.
     """
+    _check_settings(distance_threshold, vote_threshold, temperature)
     check_masks(present=present)
-    check_not_negative(distance_threshold=distance_threshold, vote_threshold=vote_threshold)
-    if isinstance(temperature, (int, float)) and not temperature > 0:  # also if it is NaN
-        raise ConfigError(f"hough_vote: temperature is {temperature}; give a number above 0, or None")
-    check_shapes(previous=(previous, "K", 3), current=(current, "K", 3), present=(present, "K"))
+    batch = check_shapes(previous=(previous, "K", 3), current=(current, "K", 3), present=(present, "K"))
+    distance_threshold = _match_pairs("distance_threshold", distance_threshold, batch, 2)
+    vote_threshold = _match_pairs("vote_threshold", vote_threshold, batch, 1)
     diagonal = torch.eye(present.shape[-1], dtype=torch.bool, device=present.device)
     comparable = present[..., :, None] & present[..., None, :] & ~diagonal
 
@@ -85,10 +88,26 @@ def hough_vote(
     if temperature is None:
         indicator = (change >= distance_threshold).to(change.dtype)
     else:
-        indicator = torch.sigmoid((change - distance_threshold) / temperature)
+        indicator = torch.sigmoid((change - distance_threshold) / _match_pairs("temperature", temperature, batch, 2))
     pair = torch.where(comparable, indicator, 0)
     votes = pair.sum(dim=-1)
     return Votes(votes.to(dtype), pair.to(dtype), change.to(dtype), dynamic=present & (votes >= vote_threshold))
+
+
+def _check_settings(
+    distance_threshold: float | Tensor, vote_threshold: float | Tensor, temperature: float | Tensor | None
+) -> None:
+    check_not_negative(distance_threshold=distance_threshold, vote_threshold=vote_threshold)
+    if isinstance(temperature, (int, float)) and not temperature > 0:  # also if it is NaN
+        raise ConfigError(f"hough_vote: temperature is {temperature}; give a number above 0, or None")
+
+
+def _match_pairs(name: str, value: float | Tensor, batch: torch.Size, dimensions: int) -> float | Tensor:
+    """Return a parameter with extra dimensions if it is one number for each problem of the batch."""
+    if not isinstance(value, Tensor) or value.numel() == 1:
+        return value
+    check_shape(name, value, *batch)
+    return value.reshape(*batch, *(1,) * dimensions)
 
 
 def _pairwise_distances(centroids: Tensor, present: Tensor) -> Tensor:
@@ -131,13 +150,16 @@ def vote_with_free_space(
     return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), pair
 
 
-class HoughVoting(torch.nn.Module):
+class HoughVoting(SettingsModule):
     """:func:`hough_vote` as a module. Distance threshold and temperature can be a `torch.nn.Parameter` that is learned.
 
     Args:
         distance_threshold: Minimum change of a distance that counts as a vote, metres.
         vote_threshold: Minimum number of votes of a dynamic object.
         temperature: Width of a soft vote, metres; None for the step function of the paper.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`hough_vote`.
     """
 
     def __init__(
@@ -146,6 +168,7 @@ class HoughVoting(torch.nn.Module):
         vote_threshold: float | Tensor,
         temperature: float | Tensor | None = None,
     ) -> None:
+        _check_settings(distance_threshold, vote_threshold, temperature)
         super().__init__()
         self.distance_threshold = distance_threshold
         self.vote_threshold = vote_threshold

@@ -22,6 +22,7 @@ from v3d_torch.geometry.argument_checks import check_masks
 from v3d_torch.geometry.camera import MAX_READOUT, PinholeCamera
 from v3d_torch.geometry.motion_field import motion_field
 from v3d_torch.geometry.precision import result_dtype
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import time_compensation as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.runtime.batches import check_shapes, fill_padding
@@ -179,8 +180,7 @@ def compensate_rolling_shutter(
         ConfigError: If ``height`` is less than 2.
     """
     check_masks(valid=valid)
-    if height < _MIN_HEIGHT:
-        raise ConfigError(f"height is {height}; give at least {_MIN_HEIGHT} rows")
+    _check_height(height)
     check_shapes(
         uv=(uv, "N", 2),
         row=(row, "N"),
@@ -204,6 +204,11 @@ def compensate_rolling_shutter(
     jacobian = jacobian.expand_as(compensated).contiguous()
     dtype = result_dtype(uv.dtype)
     return fill_padding(compensated, each, 0.0).to(dtype), fill_padding(jacobian, each, 0.0).to(dtype)
+
+
+def _check_height(height: int) -> None:
+    if height < _MIN_HEIGHT:
+        raise ConfigError(f"height is {height}; give at least {_MIN_HEIGHT} rows")
 
 
 def compensate_features(features: Features, velocity: Tensor, readout: Readout, camera: PinholeCamera) -> Features:
@@ -232,15 +237,19 @@ def compensate_features(features: Features, velocity: Tensor, readout: Readout, 
     return replace(features, uv=uv, readout_jacobian=readout_jacobian)
 
 
-class RollingShutterCompensation(torch.nn.Module):
+class RollingShutterCompensation(SettingsModule):
     """:func:`compensate_rolling_shutter` as a module. A readout given as a `torch.nn.Parameter` can be learned.
 
     Args:
         readout: Time from the first to the last row, seconds.
         height: Number of rows of the image.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`compensate_rolling_shutter`.
     """
 
     def __init__(self, readout: Tensor | float, height: int) -> None:
+        _check_height(height)
         super().__init__()
         self.readout = readout
         self.height = height

@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from v3d_torch.geometry.argument_checks import check_masks, check_positive
-from v3d_torch.geometry.gradients import needs_gradient, zero_with_gradient
+from v3d_torch.geometry.argument_checks import check_counts, check_masks, check_positive
+from v3d_torch.geometry.gradients import needs_gradient, without_second_derivatives, zero_with_gradient
 from v3d_torch.geometry.precision import result_dtype, working_dtype
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
+from v3d_torch.geometry.settings_module import SettingsModule
 from v3d_torch.kernels import pose_refinement as kernels
 from v3d_torch.kernels.compiler import compiled_by, is_all_true
 from v3d_torch.optim.implicit import jacobian
@@ -40,7 +41,13 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
-from v3d_torch.runtime.batches import check_shapes, fill_padding, fill_weights, to_rows
+from v3d_torch.runtime.batches import (
+    check_camera_matrix,
+    check_shapes,
+    fill_padding,
+    fill_weights,
+    to_rows,
+)
 
 ITERATIONS = 5
 """Default maximum number of Levenberg-Marquardt steps in a round."""
@@ -123,7 +130,7 @@ class _Problem(NamedTuple):
         zero = T_cw.new_zeros(*T_cw.shape[:-2], 6)
         H = jacobian(partial(gradient, problem=self.detach()), zero)
         H = H + REGULARISATION * torch.eye(6, dtype=H.dtype, device=H.device)
-        step = -torch.linalg.solve(H, gradient(zero, self))
+        step = -torch.linalg.solve(H, gradient(zero, _Problem(*map(without_second_derivatives, self))))
         return se3_exp(zero_with_gradient(step)) @ T_cw
 
     def expand(self, batch: torch.Size) -> _Problem:
@@ -165,17 +172,18 @@ def refine_pose(
     The result is differentiable in all inputs except the prediction, by the implicit function theorem: memory does
     not grow with the iterations. The Hessian is that of the robust cost of the last round, including the dependence of
     the robust weights on the residuals. The classification is constant. The derivatives are as accurate as the optimum:
-    train with a small ``tolerance`` and enough ``iterations``. Second derivatives are not correct.
+    train with a small ``tolerance`` and enough ``iterations``. There are no second derivatives: autograd raises an
+    InputError, and those of `torch.func` are not correct.
 
     Mur-Artal and Tardos, ORB-SLAM2, T-RO 2017, Sec. III-C; Gould et al., On Differentiating Parameterized Argmin and
     Argmax Problems, 2016.
 
     Args:
         T_cw: Predicted world-to-camera poses, shape :math:`(*, 4, 4)`. All inputs are floating point and converted to
-            float64.
+            float64. A pose whose prediction is not finite has no inliers, and is not finite.
         points: Landmark of each measurement, world frame, metres, shape :math:`(*, N, 3)`.
         uv: Measured pixels, undistorted, shape :math:`(*, N, 2)`.
-        K: Camera matrix without skew, shape :math:`(*, 3, 3)`.
+        K: Camera matrix, shape :math:`(*, 3, 3)`; its skew is ignored.
         inverse_depth: Inverse of the measured depth, 1/m, shape :math:`(*, N)`; 0, NaN or infinite = not measured.
             None if no depth was measured.
         pixel_sigma: Standard deviation of u and of v, pixels, a number or shape :math:`(*, N)`.
@@ -192,8 +200,11 @@ def refine_pose(
         least in float32. A pose without measurements is the prediction.
 
     Raises:
-        InputError: If ``valid`` is not bool, or a weight is negative, infinite or NaN.
-        ConfigError: If ``rounds``, or a standard deviation that is a number, is not positive.
+        InputError: If ``valid`` is not bool, if a weight is negative, infinite or NaN, if a standard deviation in a
+            tensor is not positive, or if ``K`` is not finite, or has a focal length that is not positive or a last row
+            other than (0, 0, 1). Values are checked only if they can be read at once.
+        ConfigError: If ``rounds``, or a standard deviation that is a number, is not positive, if ``iterations`` is
+            negative, or if ``rounds`` or ``iterations`` is not a whole number.
 
     Example:
         Learn the weights of features through the poses of 32 frames:
@@ -214,7 +225,7 @@ def refine_pose(
         ...     optimiser.step()
     """
     check_masks(valid=valid)
-    check_positive(rounds=rounds)
+    _check_limits(rounds, iterations)
     batch = check_shapes(
         T_cw=(T_cw, 4, 4),
         points=(points, "N", 3),
@@ -226,6 +237,7 @@ def refine_pose(
         weights=(weights, "N"),
         valid=(valid, "N"),
     )
+    check_camera_matrix(K)
     finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
     valid = finite if valid is None else finite & valid
     weights = fill_weights(weights, valid)
@@ -268,6 +280,11 @@ def refine_pose_unchecked(
     weights, valid = torch.ones_like(thresholds), torch.ones_like(thresholds, dtype=torch.bool)
     columns = _Problem(points, scale, offset, thresholds, weights, valid)
     return _minimise(T_cw, *columns, rounds=rounds, iterations=ITERATIONS, tolerance=POSE_TOLERANCE)[0]
+
+
+def _check_limits(rounds: int, iterations: int) -> None:
+    check_positive(rounds=rounds)
+    check_counts(rounds=rounds, iterations=iterations)
 
 
 def _is_robust(index: int, rounds: int) -> bool:
@@ -314,7 +331,7 @@ def _minimise(
     return PoseRefinement(orthonormalise(at.T_cw), inliers, problem.chi2(at), information), active
 
 
-class PoseRefiner(torch.nn.Module):
+class PoseRefiner(SettingsModule):
     """:func:`refine_pose` as a module. Standard deviations that are a `torch.nn.Parameter` can be learned.
 
     Args:
@@ -323,6 +340,9 @@ class PoseRefiner(torch.nn.Module):
         rounds: Maximum number of rounds, at least 1.
         iterations: Maximum number of Levenberg-Marquardt steps in a round.
         tolerance: Relative change of the cost that ends a round.
+
+    Raises:
+        ConfigError: If a number is not possible; see :func:`refine_pose`.
     """
 
     def __init__(
@@ -334,6 +354,8 @@ class PoseRefiner(torch.nn.Module):
         iterations: int = ITERATIONS,
         tolerance: float = POSE_TOLERANCE,
     ) -> None:
+        check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
+        _check_limits(rounds, iterations)
         super().__init__()
         self.pixel_sigma = pixel_sigma
         self.inverse_depth_sigma = inverse_depth_sigma

@@ -23,7 +23,7 @@ from v3d_torch.config import TrackingConfig
 from v3d_torch.geometry.argument_checks import check_positive, check_shape
 from v3d_torch.kernels import whitening as kernels
 from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.runtime.batches import common_batch, fill_padding, to_rows
+from v3d_torch.runtime.batches import check_sigma, common_batch, fill_padding, to_rows
 
 CHI2_THRESHOLD_2D = 5.991
 """95 % quantile of the chi-square distribution with 2 degrees of freedom: inlier threshold for (u, v)."""
@@ -84,12 +84,16 @@ def prepare_measurements(
 
     Raises:
         ConfigError: If a standard deviation that is a number is not positive.
+        InputError: If the standard deviation of a measurement in a tensor is not positive.
     """
     check_positive(pixel_sigma=pixel_sigma, inverse_depth_sigma=inverse_depth_sigma)
     for name, sigma in (("pixel_sigma", pixel_sigma), ("inverse_depth_sigma", inverse_depth_sigma)):
+        if not isinstance(sigma, Tensor):
+            continue
         # The shape (M, 1) would broadcast to M problems of a batch, each with one standard deviation.
-        if isinstance(sigma, Tensor) and sigma.numel() != 1:
+        if sigma.numel() != 1:
             check_shape(name, sigma, "*", uv.shape[-2])
+        check_sigma(name, sigma, valid)
     if inverse_depth is None:
         inverse_depth = torch.zeros_like(uv[..., 0])
     inverse_depth = fill_padding(inverse_depth, valid, 0.0)

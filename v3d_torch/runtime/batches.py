@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Number
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,9 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_shape
 from v3d_torch.kernels.compiler import can_read, to_array
+
+_MAX_ROW_ERROR = 0.01
+"""Accepted error of the last row of a camera matrix, which is not used: finite differences change all elements."""
 
 
 def fill_padding(values: Tensor, valid: Tensor | None, filler: float) -> Tensor:
@@ -90,6 +94,38 @@ def check_weights(weights: Tensor, valid: Tensor) -> None:
         raise InputError("weights has an infinite value; give finite weights")
 
 
+def check_sigma(name: str, sigma: Tensor, valid: Tensor) -> None:
+    """Check that standard deviations are positive, if they can be read at once: others make every result NaN.
+
+    Args:
+        name: Name of the argument.
+        sigma: Standard deviations of the measurements.
+        valid: Mask of the measurements that are not padding, bool, a shape that broadcasts.
+
+    Raises:
+        InputError: If the standard deviation of a measurement is not positive, also if it is NaN.
+    """
+    if can_read(sigma) and can_read(valid) and bool((~(sigma > 0) & valid).any()):
+        raise InputError(f"{name} has a value that is not positive; give standard deviations above 0")
+
+
+def check_camera_matrix(K: Tensor) -> None:
+    """Check that camera matrices are those of a pinhole camera, if they can be read at once.
+
+    Args:
+        K: Camera matrices, shape :math:`(*, 3, 3)`.
+
+    Raises:
+        InputError: If a value is not finite, a focal length is not positive, or a last row is not (0, 0, 1).
+    """
+    check_finite_arguments(K=K)
+    if can_read(K):
+        if not bool((K.diagonal(dim1=-2, dim2=-1)[..., :2] > 0).all()):
+            raise InputError("K has a focal length that is not positive; give focal lengths above 0, in pixels")
+        if not bool(((K[..., 2, :] - K.new_tensor([0, 0, 1])).abs() <= _MAX_ROW_ERROR).all()):
+            raise InputError("K has a last row other than (0, 0, 1); give matrices that are not transposed or scaled")
+
+
 def fill_weights(weights: Tensor | None, valid: Tensor) -> Tensor:
     """Return weights in float64 after `check_weights`, with 0 for padding.
 
@@ -108,15 +144,17 @@ def check_shapes(**arguments: tuple[Tensor | float | None, *tuple[int | str | No
 
     Args:
         arguments: Arguments by name, each with its dimensions without the batch: a number; a letter for a size that is
-            the same in all arguments; None for a size that is checked elsewhere. Only tensors are checked.
+            the same in all arguments; None for a size that is checked elsewhere. Numbers and None have no shape.
 
     Raises:
         ShapeError: If an argument has another shape.
-        InputError: If the batches do not broadcast.
+        InputError: If an argument is no tensor, number or None, or the batches do not broadcast.
     """
     sizes: dict[str, int] = {}
     for name, (value, *dimensions) in arguments.items():
         known = [sizes.get(str(size), size) for size in dimensions if size is not None]
+        if not isinstance(value, Tensor | Number | None):
+            check_shape(name, value, "*", *known)  # raises an error, as the value is no tensor
         if isinstance(value, Tensor) and len(known) == len(dimensions):
             check_shape(name, value, "*", *known)
             found = zip(dimensions, value.shape[value.ndim - len(dimensions) :], strict=True)
