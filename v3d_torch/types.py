@@ -30,7 +30,7 @@ MIN_INTERVAL = 0.01
 each other come from a computer that received two frames at once, and the camera has moved for longer."""
 
 _MAX_STAMP = 1e11
-"""Maximum stamp of a frame, seconds, three thousand years: a larger one is in milliseconds or nanoseconds since 1970."""
+"""Maximum stamp of a frame, seconds, three thousand years: a larger one is in milliseconds or nanoseconds."""
 
 STAMP_TOLERANCE = 1e-3
 """Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
