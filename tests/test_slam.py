@@ -218,6 +218,8 @@ def test_images_of_other_libraries_become_the_same_frame(demo: RGBDSequence) -> 
         ({"depth": np.ones((480, 640), complex)}, "the depth image is complex128; give metres"),
         ({"stamp": math.nan}, "the stamp is nan; give seconds"),
         ({"stamp": None}, "the stamp is None; give seconds"),
+        ({"stamp": 1_700_000_000_000}, "the stamp is 1700000000000, in another unit or wrong; give seconds"),
+        ({"stamp": 1.7e18}, r"the stamp is 1\.7e\+18, in another unit or wrong; give seconds"),
         ({"depth_delay": math.inf}, "the delay is inf; give seconds"),
         ({"camera": np.eye(3)}, "the camera is a ndarray; give a PinholeCamera"),
         (

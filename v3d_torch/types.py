@@ -29,6 +29,9 @@ MIN_INTERVAL = 0.01
 """Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
 each other come from a computer that received two frames at once, and the camera has moved for longer."""
 
+_MAX_STAMP = 1e11
+"""Maximum stamp of a frame, seconds, three thousand years: a larger one is in milliseconds or nanoseconds."""
+
 STAMP_TOLERANCE = 1e-3
 """Tolerance of time differences, seconds: timestamps are rounded and frame times jitter."""
 
@@ -70,7 +73,7 @@ class RGBDFrame:
 
         Args:
             index: Position in the sequence, from 0.
-            stamp: Time of the colour image, seconds.
+            stamp: Time of the colour image, seconds since any origin.
             image: Colour image, uint8 RGB, shape :math:`(H, W, 3)`; views such as ``bgr[..., ::-1]`` and PIL images
                 are accepted.
             depth: Depth registered to the colour image, shape :math:`(H, W)`: metres if floating point, else in the
@@ -83,7 +86,7 @@ class RGBDFrame:
 
         Raises:
             InputError: If an image or the gravity has the wrong shape, type or size, if depth is in whole numbers but
-                the camera has no depth scale, or if a time is not a finite number.
+                the camera has no depth scale, or if a time is not a finite number of seconds.
         """
         colour, measured = _array(image), _array(depth)
         if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
@@ -104,6 +107,8 @@ class RGBDFrame:
         for name, seconds in (("stamp", stamp), ("delay", depth_delay)):
             if not math.isfinite(to_float(seconds)):
                 raise InputError(f"frame {index}: the {name} is {seconds!r}; give seconds, as a finite number")
+        if to_float(stamp) > _MAX_STAMP:
+            raise InputError(f"frame {index}: the stamp is {stamp!r}, in another unit or wrong; give seconds")
         if not isinstance(camera, PinholeCamera | None):
             raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
         if camera is not None and colour.shape[:2] != (camera.height, camera.width):

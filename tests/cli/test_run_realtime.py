@@ -93,6 +93,32 @@ def test_masks_from_files_need_no_network(tmp_path: Path) -> None:
     assert pd.read_parquet(out / "dynamics.parquet")["class"].tolist()
 
 
+def test_live_run_cannot_be_resumed(moment: Path, tmp_path: Path) -> None:
+    """Its whole run counted as finished, although it ended when Ctrl-C was pressed."""
+    out = tmp_path / "out"
+    assert call("--seq", moment, "--segmenter", "none", "--realtime", "--out", out).exit_code == 0
+    assert_error_line(call("--resume", out), f"{out}: a live run cannot be resumed; its results are in this folder\n")
+
+
+def test_run_that_ends_before_its_first_frame_leaves_no_empty_folder(
+    moment: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as by SIGTERM while the functions are compiled."""
+
+    def interrupt(console: object) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("v3d_torch.runs.console.compile_kernels", interrupt)
+    (tmp_path / "own").mkdir()
+    for options in (["--out", "out"], [], ["--out", "own"]):
+        done = call("--seq", moment, "--segmenter", "none", "--realtime", *options)
+        assert_error_line(done, "interrupted before the results were written\n")
+    assert not (tmp_path / "out").exists() and (tmp_path / "own").exists()
+    (named,) = (tmp_path / "results").iterdir()
+    assert list(named.iterdir()) == []
+
+
 def test_stored_run_has_states_without_latency(moment: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert call("--seq", moment, "--segmenter", "none", "--out", out).exit_code == 0

@@ -61,8 +61,8 @@ def test_late_doubled_and_reordered_frames_are_rejected_and_counted(caplog: pyte
     assert [item.frame.stamp for item in queue.items] == [0.0, 1.0, 2.0, 4.0, 5.0]
     assert [item.number for item in queue.items] == [1, 2, 3, 4, 5]
     assert captured.rejected == 4
-    dropped = ["frame 2 is dropped", "frame 5 is dropped", "frame 7 is dropped"]
-    assert [record.getMessage()[:18] for record in caplog.records] == dropped
+    rejected = ["frame 2 is rejected", "frame 5 is rejected", "frame 7 is rejected"]
+    assert [record.getMessage()[:19] for record in caplog.records] == rejected
 
 
 def test_clock_that_was_set_back_is_an_input_error() -> None:
@@ -143,6 +143,26 @@ def test_closing_stops_source_and_thread() -> None:
     assert [thread.name for thread in set(threading.enumerate()) - before] == ["capture"]
     captured.close()
     assert set(threading.enumerate()) <= before
+
+
+def test_source_that_does_not_end_is_reported(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v3d_torch.live.frame_capture._JOIN_TIMEOUT", 0.05)
+    taken, end = threading.Event(), threading.Event()
+
+    def waiting() -> Iterator[RGBDFrame]:
+        yield FRAME
+        taken.set()
+        end.wait(60)
+
+    captured = FrameCapture(waiting(), accept, MONOTONIC_CLOCK)
+    captured.start()
+    assert taken.wait(5)
+    captured.close()
+    end.set()
+    (message,) = (record.getMessage() for record in caplog.records)
+    assert message == "the source of the frames does not end: a thread waits for its next frame; end the source"
 
 
 def test_ten_minutes_without_a_consumer_keep_only_the_first_and_the_newest_frame() -> None:

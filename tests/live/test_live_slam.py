@@ -17,6 +17,8 @@ from helpers.waiting import wait_until
 from torch import Tensor
 
 from v3d_torch.config import Config
+from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.live import LiveResult, LiveSLAM
 from v3d_torch.live.frame_capture import CapturedFrame, FrameCapture
@@ -24,6 +26,7 @@ from v3d_torch.live.latest_queue import LatestQueue
 from v3d_torch.live.live_preprocessor import LivePreprocessor
 from v3d_torch.objects.appearance import colour_histograms
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK
+from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame, TrackingStatus
 
@@ -271,6 +274,46 @@ def test_rejected_frames_are_counted_over_several_loops() -> None:
     live = LiveSLAM(Resumed(), V3DSLAM(CAMERA, square))
     assert list(live) and live.rejected == 1
     assert list(live) and live.rejected == 1
+
+
+def test_stop_ends_the_loop_from_another_thread() -> None:
+    source, send = feed()
+    live, indices = LiveSLAM(source, V3DSLAM(CAMERA, square)), []
+
+    def stop() -> None:
+        live.stop()
+        send()  # this source blocks until its next frame
+
+    live.stop()  # nothing runs yet
+    for result in live:
+        indices.append(result.frame.index)
+        if result.frame.index < 2:
+            send()
+        else:
+            threading.Timer(0.1, stop).start()
+    assert indices == [0, 1, 2]
+
+
+def test_stop_ends_the_playback_of_a_sequence() -> None:
+    live = LiveSLAM(RealtimePlayback(Wall()), V3DSLAM(CAMERA, square))
+    assert 1 <= len([live.stop() for _ in live]) < FRAMES  # a frame that waits is tracked
+
+
+def test_stored_sequence_is_rejected() -> None:
+    """Most of its frames were dropped, because they do not come at their own rate."""
+    sequence = load_sequence("demo")
+    with pytest.raises(InputError, match=r"^demo: is stored, and most of its frames would be dropped; wrap it in Real"):
+        LiveSLAM(sequence, V3DSLAM(sequence.camera, NoSegmentation()))
+
+
+@pytest.mark.parametrize("is_same", [True, False])
+def test_second_loop_with_earlier_frames_is_an_input_error(is_same: bool) -> None:
+    live = LiveSLAM([Wall()[1]], V3DSLAM(CAMERA, square))
+    assert len(list(live)) == 1
+    again = live if is_same else LiveSLAM([Wall()[1]], live.slam)
+    message = r"^frame 1: its stamp is 0\.100000 s, but this system has tracked frames up to 0\.100000 s; make a new"
+    with pytest.raises(InputError, match=message):
+        next(iter(again))
 
 
 def test_configuration_without_threads_is_rejected() -> None:

@@ -26,6 +26,7 @@ from v3d_torch.mapping.map_io import StoredMap, load_map, save_map
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.odometry.rolling_shutter import GLOBAL_SHUTTER, Readout
+from v3d_torch.slam import V3DSLAM
 
 CONFIG = load_config(overrides=["segmentation.source=none"])
 CAMERA = replace(long_wall.CAMERA, readout=None)
@@ -154,6 +155,12 @@ def test_map_without_views_can_be_saved_and_loaded_with_any_stride(tmp_path: Pat
     )
     assert len(loaded.views) == 0
     assert_same(StoredMap(stored.map, loaded.views), loaded)
+
+
+def test_something_else_than_a_map_is_an_input_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"room\.map: a V3DSLAM is no map; give a SparseMap, such as slam\.map$"):
+        save_map(tmp_path / "room.map", V3DSLAM(CAMERA, config=CONFIG))  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_error_names_the_path_that_cannot_be_written(tmp_path: Path) -> None:

@@ -12,10 +12,11 @@ import torch
 import yaml
 from helpers.box_room import ROOM
 from helpers.occupancy_scenes import CONFIG, add_view, box_of_voxels, map_of
+from kornia.core.exceptions import ShapeError
 from torch import Tensor
 
 from v3d_torch.config.loading import load_config
-from v3d_torch.errors import ConfigError, OutputError
+from v3d_torch.errors import ConfigError, InputError, OutputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.voxel_blocks import VOLUME
 from v3d_torch.occupancy import voxel_blocks
@@ -46,7 +47,7 @@ def chosen() -> OccupancyGrid:
 
 
 def state_below(grid: OccupancyGrid, point: Tensor) -> int:
-    """State of the cell below a point of the world; unknown outside of the grid."""
+    """State of the cell below a point of the world, computed from the attributes; unknown outside of the grid."""
     level = grid.T_lw[:2, :3] @ point - torch.tensor(grid.origin, dtype=torch.float64)
     column, row = (level / grid.cell_size).floor().long().tolist()
     is_inside = 0 <= row < grid.states.shape[0] and 0 <= column < grid.states.shape[1]
@@ -119,6 +120,42 @@ def test_grid_of_a_room_shows_its_walls_also_in_a_tilted_world(twist: tuple[floa
     assert state(right + 0.3, 0.0) == VoxelState.UNKNOWN
 
 
+@pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (0.35, 0.5, 0.25)])
+def test_states_below_points_follow_the_conventions_of_the_grid(twist: tuple[float, float, float]) -> None:
+    """Also in a tilted world, at any height, and outside of the grid, where the cells are unknown."""
+    T_ow = se3_exp(torch.tensor([0.1, 0.2, 0.3, *twist], dtype=torch.float64))
+    grid = grid_of_room(T_ow)
+    points = 8 * torch.rand(40, 50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) - 4
+    states = grid.states_below(points)
+    assert states.shape == (40, 50) and states.dtype == torch.int8
+    assert states.flatten().tolist() == [state_below(grid, point) for point in points.view(-1, 3)]
+    assert len(states.unique()) == 3
+    assert grid.states_below(points[0, 0]).item() == states[0, 0]
+    assert torch.equal(grid.states_below(points.float().requires_grad_())[:2], grid.states_below(points.float())[:2])
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30])
+def test_states_below_points_that_are_not_finite_or_very_far_away_are_unknown(
+    bad: float, chosen: OccupancyGrid
+) -> None:
+    points = torch.tensor([[bad, 0.0, 0.1], [0.1, bad, 0.1], [0.1, 0.0, bad]])
+    assert chosen.states_below(points)[[0, 2]].tolist() == 2 * [VoxelState.UNKNOWN]
+    empty = occupancy_grid(OccupancyMap(CONFIG), FLOOR)
+    assert empty.states_below(points.new_zeros(2, 3)).tolist() == 2 * [VoxelState.UNKNOWN]
+
+
+def test_points_without_three_coordinates_have_no_states(chosen: OccupancyGrid) -> None:
+    with pytest.raises(ShapeError, match=r"^points has the shape \(4, 2\)"):
+        chosen.states_below(torch.ones(4, 2))
+    with pytest.raises(InputError, match=r"^points is of type ndarray; give a torch.Tensor"):
+        chosen.states_below(np.ones((4, 3)))  # type: ignore[arg-type]
+
+
+def test_map_without_a_floor_has_no_grid() -> None:
+    with pytest.raises(InputError, match=r"^a grid needs a floor, and none was found; let the camera see the floor$"):
+        occupancy_grid(OccupancyMap(CONFIG), None)
+
+
 def test_grid_does_not_depend_on_the_size_of_the_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     occupancy = map_of(box_of_voxels((30, -5, 3), (33, -3, 40)), box_of_voxels((-20, -12, -20), (30, -1, 50)))
     whole = occupancy_grid(occupancy, FLOOR, HEIGHTS)
@@ -175,6 +212,14 @@ def test_map_server_reads_the_states_from_the_files(chosen: OccupancyGrid, tmp_p
     states = np.where(occupancy > about["occupied_thresh"], VoxelState.OCCUPIED, unknown)
     states = np.where(occupancy < about["free_thresh"], VoxelState.FREE, states)
     assert np.array_equal(states[::-1], chosen.states.numpy())  # the last row of the image has the smallest y
+
+
+@pytest.mark.parametrize("name", ["map.pgm", "map"])
+def test_name_of_another_suffix_is_an_output_error(name: str, chosen: OccupancyGrid, tmp_path: Path) -> None:
+    """The description replaced an image of the same name."""
+    with pytest.raises(OutputError, match=rf"{name}: is not the name of a YAML file; choose a name that ends in .yaml"):
+        write_map_server_files(tmp_path / name, chosen)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_origin_is_written_without_rounding_errors(tmp_path: Path) -> None:

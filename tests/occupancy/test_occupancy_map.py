@@ -20,11 +20,14 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
+from v3d_torch.occupancy import occupancy_map
+from v3d_torch.occupancy.clearance import NearestVoxels
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.occupancy.range_view import RangeView
 
 SIZE = CONFIG.voxel_size
 EYE = torch.eye(4, dtype=torch.float64)
+NEAR_BOX = [[-0.2, -0.2, 1.2], [0.2, 0.2, 1.4]]
 
 
 @pytest.fixture(scope="module")
@@ -215,6 +218,17 @@ def test_image_without_pixels_is_an_input_error(size: tuple[int, int]) -> None:
         OccupancyMap(CONFIG).integrate(torch.ones(size), static, rays, EYE)
 
 
+@pytest.mark.parametrize("query", ["states", "probability", "is_free", "distance", "gradient"])
+def test_points_in_an_array_are_rejected(query: str, room: OccupancyMap) -> None:
+    with pytest.raises(InputError, match=r"^points is of type ndarray; give a torch.Tensor of shape \(\.\.\., 3\)$"):
+        getattr(room, query)(np.ones((4, 3)))
+
+
+def test_radius_can_be_a_tensor(room: OccupancyMap) -> None:
+    points = room.free_points[::100]
+    assert torch.equal(room.is_free(points, torch.tensor(0.2)), room.is_free(points, float(torch.tensor(0.2))))
+
+
 @pytest.mark.parametrize("radius", [-0.1, torch.nan, torch.inf])
 def test_radius_that_is_negative_or_not_finite_is_an_input_error(radius: float, room: OccupancyMap) -> None:
     with pytest.raises(InputError, match=rf"the radius of balls is {radius} m; give a finite radius of at least 0"):
@@ -282,8 +296,35 @@ def test_distances_follow_the_map() -> None:
     occupancy, point = OccupancyMap(CONFIG), torch.tensor([[0.0, 0.0, 1.0]])
     add_view(occupancy, 0, EYE)
     before = occupancy.distance(point)
-    add_view(occupancy, 1, EYE, torch.tensor([[-0.2, -0.2, 1.2], [0.2, 0.2, 1.4]]))
+    add_view(occupancy, 1, EYE, torch.tensor(NEAR_BOX))
     assert occupancy.distance(point) < before - 0.3
+
+
+def test_distances_follow_a_view_that_is_added_while_another_thread_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tree of the map without the view stayed in use."""
+    occupancy, point, box = OccupancyMap(CONFIG), torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor(NEAR_BOX)
+    add_view(occupancy, 0, EYE)
+
+    class Slow(NearestVoxels):
+        def __init__(self, centres: Tensor, max_distance: float) -> None:
+            super().__init__(centres, max_distance)
+            monkeypatch.undo()
+            add_view(occupancy, 1, EYE, box)
+
+    monkeypatch.setattr(occupancy_map, "NearestVoxels", Slow)
+    before = occupancy.distance(point)
+    assert occupancy.distance(point) < before - 0.3
+
+
+def test_blocks_that_another_thread_reads_keep_their_index() -> None:
+    """Their keys belonged to other rows while blocks were added or removed."""
+    occupancy = OccupancyMap(OccupancyConfig(max_blocks=20, window_radius=0.1))
+    add_view(occupancy, 0, EYE)
+    blocks, coordinates = occupancy.blocks, occupancy.blocks.coordinates
+    for number, T_wc in enumerate(looking_around(6)):
+        add_view(occupancy, number, T_wc)
+    assert occupancy.blocks is not blocks and blocks.coordinates is coordinates
+    assert len(blocks.keys) == len(blocks.rows) == len(coordinates) == len(blocks.log_odds)
 
 
 @pytest.mark.parametrize("change", ["replace_blocks", "load_state_dict"])

@@ -259,7 +259,9 @@ def test_keyframe_of_an_earlier_run_is_none_of_this_run_even_at_the_same_time(
     assert changed.tolist() == list(range(FRAMES + 6, FRAMES + 12))
 
 
-def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -> None:
+def test_occupancy_map_is_written_if_configured(
+    results: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     assert not {"occupancy.npz", "occupancy.bt", "map.pgm", "map.yaml"} & {path.name for path in results.iterdir()}
     run = run_along_wall("occupancy.enabled=true")
     run.flush()
@@ -270,6 +272,7 @@ def test_occupancy_map_is_written_if_configured(results: Path, tmp_path: Path) -
     assert (stored.map.occupied_points[:, 2] - WALL).abs().max() < 0.05
     assert (tmp_path / "occupancy.bt").read_bytes().startswith(b"# Octomap OcTree binary file\n")
     assert stored.floor is None and not (tmp_path / "map.yaml").exists()  # a wall is no floor
+    assert "no floor is visible; no 2D grid was written; let the camera see the floor" in caplog.text
     assert cv2.imread(str(tmp_path / "figures" / "occupancy.png")) is not None
 
 

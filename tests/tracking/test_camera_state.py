@@ -54,6 +54,17 @@ def test_prediction_follows_the_twist_and_stops_after_a_fifth_of_a_second() -> N
     assert not later.twist.any() and later.stamp == 3.0
 
 
+def test_prediction_without_a_frame_for_more_than_a_second_is_lost() -> None:
+    """An unplugged camera was tracked for ever, with a standard deviation of 12.8 m after 8 s."""
+    for status in TrackingStatus:
+        now = state(5.0, status=status)
+        assert [now.predict(stamp).status for stamp in (5.0, 5.2, 6.0)] == [status] * 3
+        assert [now.predict(stamp).status for stamp in (6.01, 13.0)] == [TrackingStatus.LOST] * 2
+    assert 0.9 < state(5.0).predict(6.0).covariance[:3, :3].trace().sqrt() < 1.1
+    states = history(0.0, 5.0)
+    assert states.at(4.0).status is TrackingStatus.TRACKED and states.at(6.01).status is TrackingStatus.LOST
+
+
 @pytest.mark.parametrize("stamp", [0.9, -10.0, math.nan])
 def test_prediction_of_an_earlier_time_is_an_input_error(stamp: float) -> None:
     """Its covariance would have negative eigenvalues."""
@@ -238,6 +249,13 @@ def test_measured_motion_is_known_before_the_frame_is_tracked_in_the_map() -> No
     states.append(state(0.2))
     torch.testing.assert_close(states.at(0.2).T_wc, state(0.2).T_wc)
     assert len(states.state_dict()["states"]) == 3
+
+
+def test_motion_that_was_measured_over_a_gap_keeps_the_status() -> None:
+    states = history(0.0, 0.1)
+    states.append_motion(3.0, measured_motion(is_measured=True))
+    assert states.at(3.0).status is states.at(3.9).status is TrackingStatus.TRACKED
+    assert states.at(4.1).status is TrackingStatus.LOST
 
 
 def test_motion_that_was_not_measured_changes_no_state() -> None:

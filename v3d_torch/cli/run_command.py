@@ -27,7 +27,7 @@ from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
-from v3d_torch.runs.checkpoint import Checkpoint, describe_change, is_finished, read_checkpoint
+from v3d_torch.runs.checkpoint import Checkpoint, check_not_live, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
 from v3d_torch.runs.map_file import check_map_path
@@ -36,7 +36,7 @@ from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest, check_not_moved
-from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder
+from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder, remove_empty_folder
 from v3d_torch.runs.run import Run
 from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.system import check_map_is_given
@@ -150,8 +150,9 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
         display: Output on the screen.
 
     Raises:
-        V3DError: If there is no checkpoint, if an option conflicts with the run, or as for `start_run`.
+        V3DError: If there is no checkpoint, if the run was live, if an option conflicts with it, or as for `start_run`.
     """
+    check_not_live(folder)
     if is_finished(folder):
         print_line(Console(soft_wrap=True), f"{folder}: the run is finished; nothing to resume")
         return
@@ -204,6 +205,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     if checkpoint is not None:
         _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
     viewer = display.make_viewer(sequence)
+    is_new = out is None or not out.exists()
     folder = make_result_folder(out, sequence.name)
     if replaces_results:
         print_line(console, f"note: {folder}: the results of an earlier run are replaced")
@@ -223,6 +225,8 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     except OutputError as error:
         raise OutputError(f"{error}{_way_to_resume(folder, sequence)}") from error
     except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
+        if is_new:
+            remove_empty_folder(folder)
         raise InputError(
             f"{folder}: interrupted before the results were written{_way_to_resume(folder, sequence)}"
         ) from interrupt

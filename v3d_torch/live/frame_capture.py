@@ -67,14 +67,20 @@ class FrameCapture:
         """Start the thread."""
         self._thread.start()
 
-    def close(self) -> None:
-        """Stop the thread, and the source if it is a `LiveStream`."""
+    def stop(self) -> None:
+        """Close the queue of frames, and stop the source if it is a `LiveStream`; can be called from any thread."""
         self._stop.set()
         self.frames.close()
         if isinstance(self._source, LiveStream):
             self._source.stop()
+
+    def close(self) -> None:
+        """Stop, and wait for the end of the thread."""
+        self.stop()
         if self._thread.is_alive() and threading.current_thread() is not self._thread:
             self._thread.join(_JOIN_TIMEOUT)
+            if self._thread.is_alive():
+                _LOG.warning("the source of the frames does not end: a thread waits for its next frame; end the source")
 
     def _run(self) -> None:
         try:
@@ -101,7 +107,7 @@ class FrameCapture:
             return True
         if not self._rejected_in_a_row:
             _LOG.warning(
-                "frame %d is dropped: its stamp, %.6f s, is not after %.6f s, that of an earlier frame",
+                "frame %d is rejected: its stamp, %.6f s, is not after %.6f s, that of an earlier frame",
                 frame.index, frame.stamp, self._newest_stamp,
             )  # fmt: skip
         self.rejected += 1

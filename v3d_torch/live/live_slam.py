@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 import torch
 
-from v3d_torch.errors import ConfigError
+from v3d_torch.datasets.base import RGBDSequence
+from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.frame_result import FrameResult
+from v3d_torch.io.timestamps import round_timestamp
 from v3d_torch.live.frame_capture import FrameCapture
 from v3d_torch.live.live_preprocessor import LivePreprocessor
 from v3d_torch.objects.assignment import match_instances
@@ -58,7 +60,7 @@ class LiveSLAM:
 
     Each stage takes the newest frame that is ready, and no other frame waits, except the first. If tracking is slower
     than the camera, frames are dropped and counted. Iterate over the results, or call the object with a callback; both
-    end with the source.
+    end with the source, or by `stop`. Several loops can follow each other if their frames are later and later.
 
     Args:
         source: Frames at their own rate: a camera (``open_source("realsense:")``), a `RealtimePlayback`, or any
@@ -70,12 +72,18 @@ class LiveSLAM:
         dropped: Number of frames that were dropped so far.
 
     Raises:
+        InputError: If the source is a stored sequence, whose frames do not come at their own rate.
         ConfigError: If the configuration does not allow threads (``prefetch=false``).
     """
 
     def __init__(self, source: Iterable[RGBDFrame], slam: V3DSLAM, clock: Clock = MONOTONIC_CLOCK) -> None:
         if not slam.config.prefetch:
             raise ConfigError("prefetch=false: a live camera needs threads; remove --serial or set prefetch=true")
+        if isinstance(source, RGBDSequence):
+            raise InputError(
+                f"{source.name}: is stored, and most of its frames would be dropped; wrap it in RealtimePlayback, or"
+                " call slam(frame) for each frame"
+            )
         self.slam = slam
         self.dropped = 0
         self._source = source
@@ -95,12 +103,13 @@ class LiveSLAM:
         The frames that are being captured and preprocessed when the loop is left are discarded, and not counted.
 
         Raises:
-            InputError: If the source ends with an error, or a frame is not valid.
+            InputError: If the source ends with an error, a frame is not valid, or the first one is not later than the
+                frames that the system has tracked.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
-        _warm_up(self.slam)
         self._rejected_before = self.rejected
         self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
+        _warm_up(self.slam)
         preprocessor = LivePreprocessor(capture.frames, self.slam)
         hook = self.slam.register_stage_hook("odometry", self._record_motion)
         with closing(preprocessor), closing(capture), hook:
@@ -108,6 +117,8 @@ class LiveSLAM:
             preprocessor.start()
             number = 0
             while (live := preprocessor.frames.take()) is not None:
+                if number == 0:
+                    self._check_first(live.captured.frame)
                 preprocessor.begin_tracking(live)
                 result = self.slam.track(live.preprocessed)
                 preprocessor.end_tracking()
@@ -139,9 +150,27 @@ class LiveSLAM:
         for result in self:
             on_result(result)
 
+    def stop(self) -> None:
+        """End the iteration; can be called from any thread.
+
+        Frames that already wait are still tracked. A `LiveStream` is stopped. Any other source has to end by itself;
+        the iteration ends without it, after a wait of two seconds, and its thread waits for its next frame.
+        """
+        if self._capture is not None:
+            self._capture.stop()
+
     def pose_at(self, stamp: float) -> CameraState:
         """Return the state of the camera at a time, see `V3DSLAM.pose_at`; can be called from any thread."""
         return self.slam.pose_at(stamp)
+
+    def _check_first(self, frame: RGBDFrame) -> None:
+        """Raise InputError if the first frame of a loop is not later than the frames that the system has tracked."""
+        tracked = self.slam.poses.stamp
+        if round_timestamp(frame.stamp) <= round_timestamp(tracked):
+            raise InputError(
+                f"frame {frame.index}: its stamp is {frame.stamp:.6f} s, but this system has tracked frames up to"
+                f" {tracked:.6f} s; make a new V3DSLAM"
+            )
 
     def _record_motion(self, name: str, arguments: tuple[object, ...], motion: CameraMotion) -> None:
         self._measured_at = self._clock.now() if motion.is_measured else None

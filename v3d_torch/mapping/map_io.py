@@ -65,8 +65,11 @@ def save_map(path: StrPath, sparse_map: SparseMap, views: StaticViews | None = N
             the map densely.
 
     Raises:
+        InputError: If the second argument is no map.
         OutputError: If the file cannot be written.
     """
+    if not isinstance(sparse_map, SparseMap):
+        raise InputError(f"{path}: a {type(sparse_map).__name__} is no map; give a SparseMap, such as slam.map")
     views = StaticViews(sparse_map.camera, stride=1) if views is None else views
     about = {
         "format": MAP_FORMAT,

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 import yaml
 
+from v3d_torch.errors import OutputError
 from v3d_torch.io.files import atomic_write, write_text
 from v3d_torch.io.paths import StrPath
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
@@ -27,13 +28,15 @@ def write_map_server_files(path: StrPath, grid: OccupancyGrid) -> None:
     """Write a grid as ``.pgm`` and ``.yaml``.
 
     Args:
-        path: Path of the YAML file; the image is written beside it.
+        path: Path of the YAML file, ``.yaml`` or ``.yml``; the image is written beside it.
         grid: 2D grid, see `occupancy_grid`.
 
     Raises:
-        OutputError: If a file cannot be written.
+        OutputError: If the path has another suffix, or a file cannot be written.
     """
     path = Path(path)
+    if path.suffix not in (".yaml", ".yml"):
+        raise OutputError(f"{path}: is not the name of a YAML file; choose a name that ends in .yaml")
     image = path.with_suffix(".pgm")
     values = torch.tensor([_GREY[state] for state in VoxelState], dtype=torch.uint8)
     grey = values[grid.states.flip(0).to(torch.int64) + 1]  # the first row of the image has the largest y

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from v3d_torch.errors import ConfigError
+from v3d_torch.errors import ConfigError, InputError
+from v3d_torch.geometry.argument_checks import check_shape
 from v3d_torch.geometry.level_frame import level_frame
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
@@ -37,8 +38,33 @@ class OccupancyGrid:
     T_lw: Tensor
     height: float
 
+    def states_below(self, points: Tensor) -> Tensor:
+        """State of the cell below or above each point.
 
-def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, float] | None = None) -> OccupancyGrid:
+        Args:
+            points: Points, world frame, metres, shape :math:`(..., 3)`.
+
+        Returns:
+            Values of `VoxelState`, int8, shape :math:`(...)`; unknown outside of the grid, and for points that are not
+            finite.
+
+        Raises:
+            InputError: If the points are no tensor.
+        """
+        check_shape("points", points, "*", 3)
+        level = points.detach().to(torch.float64) @ self.T_lw[:2, :3].T + self.T_lw[:2, 3]
+        cell = ((level - torch.tensor(self.origin, dtype=torch.float64)) / self.cell_size).floor()
+        rows, columns = self.states.shape
+        inside = ((cell >= 0) & (cell < torch.tensor([columns, rows]))).all(dim=-1)
+        states = torch.full(inside.shape, VoxelState.UNKNOWN, dtype=torch.int8)
+        column, row = cell[inside].to(torch.int64).unbind(dim=-1)
+        states[inside] = self.states[row, column]
+        return states
+
+
+def occupancy_grid(
+    occupancy: OccupancyMap, floor: Floor | None, heights: tuple[float, float] | None = None
+) -> OccupancyGrid:
     """Project an occupancy map onto its floor.
 
     A cell is occupied if the centre of any occupied voxel between the heights lies above it. It is free if it is not
@@ -50,8 +76,11 @@ def occupancy_grid(occupancy: OccupancyMap, floor: Floor, heights: tuple[float, 
         heights: Lowest and highest obstacle, metres above the floor; None for those of the configuration.
 
     Raises:
+        InputError: If the floor is None, because none was found.
         ConfigError: If the lowest height is not below the highest, or a height is not finite.
     """
+    if floor is None:
+        raise InputError("a grid needs a floor, and none was found; let the camera see the floor")
     size, (low, high) = occupancy.config.voxel_size, heights or occupancy.config.obstacle_heights
     if not -math.inf < low < high < math.inf:
         raise ConfigError(f"heights ({low}, {high}): give the lowest obstacle first, then the highest, both finite")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import math
 from collections.abc import Iterator, Mapping
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.config import OccupancyConfig
+from v3d_torch.config.validation import to_float
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.argument_checks import check_masks, check_shape
 from v3d_torch.geometry.cell_keys import MAX_COORDINATE
@@ -52,6 +54,9 @@ class OccupancyMap:
     is occupied if its probability is at least 0.5, and unknown if it was never observed. All queries take batches of
     points.
 
+    `states`, `probability`, `is_free`, `distance` and `gradient` can be called from another thread while `integrate`
+    runs. They see the map with or without the newest view, or with it in some voxels only.
+
     Args:
         config: Sensor model, size of voxels, bounds of memory and distances.
     """
@@ -60,7 +65,7 @@ class OccupancyMap:
         self.config = config
         self.blocks = VoxelBlocks()
         self.sensor_model = SensorModel.from_config(config)
-        self._nearest: NearestVoxels | None = None  # of the occupied voxels; None after they changed
+        self._nearest: tuple[VoxelBlocks, NearestVoxels] | None = None  # the occupied voxels of some blocks
         self._is_full_window_reported = False
 
     @property
@@ -119,10 +124,11 @@ class OccupancyMap:
                 " the origin"
             )
         limits = config.voxel_size, config.max_depth, config.depth_tolerance
-        self.blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self.sensor_model)
-        if len(self.blocks) > config.max_blocks:
-            self._remove_farthest(T_wc[:3, 3])
-        self._nearest = None
+        blocks = copy.copy(self.blocks)  # shares the voxels, while other threads read the blocks as they were
+        blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self.sensor_model)
+        if len(blocks) > config.max_blocks:
+            self._remove_farthest(blocks, T_wc[:3, 3])
+        self.blocks = blocks
 
     def states(self, points: Tensor) -> Tensor:
         """State of the voxel around each point.
@@ -150,12 +156,12 @@ class OccupancyMap:
         probability = torch.sigmoid(log_odds.to(torch.float64) * self.sensor_model.step)
         return torch.where(log_odds == UNKNOWN, torch.nan, probability).reshape(points.shape[:-1])
 
-    def is_free(self, points: Tensor, radius: float = 0.0) -> Tensor:
+    def is_free(self, points: Tensor, radius: float | Tensor = 0.0) -> Tensor:
         """Check whether balls lie in free space. Unknown space is not free.
 
         Args:
             points: Centres of the balls, world frame, metres, shape :math:`(..., 3)`.
-            radius: Radius of the balls, metres.
+            radius: Radius of the balls, metres; a tensor with one value is accepted.
 
         Returns:
             True if every voxel that a ball touches is free, bool, shape :math:`(...)`; false for centres that are not
@@ -164,8 +170,10 @@ class OccupancyMap:
         Raises:
             InputError: If the radius is negative or not finite.
         """
+        radius = to_float(radius)
         if not (math.isfinite(radius) and radius >= 0):
             raise InputError(f"the radius of balls is {radius} m; give a finite radius of at least 0")
+        check_shape("points", points, "*", 3)
         if 2 * radius > self._smallest_extent():  # such a ball touches unknown space; its voxels could be too many
             return torch.zeros(points.shape[:-1], dtype=torch.bool)
         free = are_balls_free(self.blocks, _rows(points), radius, self.config.voxel_size).reshape(points.shape[:-1])
@@ -196,13 +204,13 @@ class OccupancyMap:
             Gradients, float64, shape :math:`(..., 3)`; 0 where the distance is truncated or 0, NaN where space is
             unknown.
         """
-        offset, near = self._offsets(points.detach())
-        gradient = torch.where(near[..., None], torch.nn.functional.normalize(offset, dim=-1), 0.0)
+        offset, near = self._offsets(points)
+        gradient = torch.where(near[..., None], torch.nn.functional.normalize(offset.detach(), dim=-1), 0.0)
         return torch.where(self.states(points)[..., None] == VoxelState.UNKNOWN, torch.nan, gradient)
 
     def replace_blocks(self, blocks: VoxelBlocks) -> None:
         """Replace the content of the map."""
-        self.blocks, self._nearest = blocks, None
+        self.blocks = blocks
 
     def state_dict(self) -> dict[str, Any]:
         """Return the blocks of the map."""
@@ -210,14 +218,16 @@ class OccupancyMap:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore the blocks of `state_dict`."""
+        self.blocks = VoxelBlocks()
         self.blocks.load_state_dict(state)
-        self._nearest = None
 
     def _offsets(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Vectors from the nearest occupied voxels to points, (..., 3), and mask of those not truncated, (...)."""
-        if self._nearest is None:
-            self._nearest = NearestVoxels(self.occupied_points, self.config.max_distance)
-        nearest, near = self._nearest(_rows(points))
+        rows, blocks, stored = _rows(points), self.blocks, self._nearest
+        if stored is None or stored[0] is not blocks:  # every change of the map makes other blocks
+            stored = blocks, NearestVoxels(self.occupied_points, self.config.max_distance)
+            self._nearest = stored
+        nearest, near = stored[1](rows)
         return points.to(torch.float64) - nearest.reshape(points.shape), near.reshape(points.shape[:-1])
 
     def _smallest_extent(self) -> float:
@@ -232,16 +242,16 @@ class OccupancyMap:
         """Coordinates of the voxels around points (..., 3), int64, (N, 3)."""
         return (_rows(points) / self.config.voxel_size).floor().to(torch.int64)
 
-    def _remove_farthest(self, camera: Tensor) -> None:
+    def _remove_farthest(self, blocks: VoxelBlocks, camera: Tensor) -> None:
         """Remove the blocks farthest from the camera, but no block within the window around the camera."""
         side = SIDE * self.config.voxel_size
-        gap = cube_gap(camera, self.blocks.coordinates, side)
+        gap = cube_gap(camera, blocks.coordinates, side)
         kept = max(int(_KEPT_FRACTION * self.config.max_blocks), 1)
         limit = max(float(gap.kthvalue(kept).values), self.config.window_radius)
         is_kept = gap <= limit
-        before, after = len(self.blocks), int(is_kept.sum())
+        before, after = len(blocks), int(is_kept.sum())
         if after < before:
-            self.blocks.keep(is_kept)
+            blocks.keep(is_kept)
         if after > self.config.max_blocks:
             self._report_full_window(after)
         else:

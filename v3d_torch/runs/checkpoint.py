@@ -135,6 +135,17 @@ def is_finished(folder: Path) -> bool:
     return path.is_file() and read_metrics(path).failure is None
 
 
+def check_not_live(folder: Path) -> None:
+    """Check that the results in a folder are not those of a live run, whose frames are gone.
+
+    Raises:
+        InputError: If they are, or if its ``metrics.json`` is damaged.
+    """
+    path = folder / RunFile.METRICS
+    if path.is_file() and read_metrics(path).latency is not None:
+        raise InputError(f"{folder}: a live run cannot be resumed; its results are in this folder")
+
+
 def read_checkpoint(folder: Path) -> Checkpoint:
     """Read the checkpoint of a run that ended early.
 

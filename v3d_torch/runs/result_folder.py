@@ -57,6 +57,15 @@ def make_result_folder(out: Path | None, name: str) -> Path:
     return folder
 
 
+def remove_empty_folder(folder: Path) -> None:
+    """Remove the folder of `make_result_folder` and the link to it, if a run has written nothing to the folder."""
+    link = folder.with_name("latest")
+    with suppress(OSError):
+        folder.rmdir()
+        if link.is_symlink() and not link.exists():
+            link.unlink()
+
+
 def _unmakeable_error(folder: Path, error: OSError) -> OutputError:
     return OutputError(f"{folder}: cannot be made ({error.strerror}); choose another folder with --out")
 

@@ -201,6 +201,6 @@ def _write_occupancy(folder: Path, mapper: OccupancyMapper) -> None:
     save_occupancy(folder / RunFile.OCCUPANCY, mapper.map, floor)
     write_octomap(folder / RunFile.OCTOMAP, mapper.map)
     if floor is None:
-        _LOG.warning("occupancy map: no floor is visible; no 2D grid was written")
+        _LOG.warning("occupancy map: no floor is visible; no 2D grid was written; let the camera see the floor")
     else:
         write_map_server_files(folder / RunFile.GRID, occupancy_grid(mapper.map, floor))

@@ -13,6 +13,10 @@ from v3d_torch.tracking.motion_model import MAX_EXTRAPOLATION
 from v3d_torch.tracking.pose_kalman_filter import join_covariances, predict_covariance
 from v3d_torch.types import TrackingStatus
 
+_LOST_AFTER = 1.0
+"""Time without a frame after which the camera counts as lost, seconds: its position is then uncertain by a metre, as
+large as a robot, because its motion has been unknown for most of that time."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraState:
@@ -48,7 +52,8 @@ class CameraState:
         """Predict the camera at a later time, with constant twist and growing covariance.
 
         The predicted camera stops after `MAX_EXTRAPOLATION` seconds, because a handheld camera changes its motion
-        within that time; the covariance includes the unknown motion after it.
+        within that time; the covariance includes the unknown motion after it. A camera without a frame for more than a
+        second has the status `TrackingStatus.LOST`.
 
         Args:
             stamp: Time, seconds, not before that of this state.
@@ -74,7 +79,7 @@ class CameraState:
         return CameraState(
             stamp=stamp,
             T_wc=T_wc,
-            status=self.status,
+            status=TrackingStatus.LOST if stamp - self.stamp > _LOST_AFTER else self.status,
             covariance=joint[:6, :6],
             twist=twist,
             twist_covariance=joint[6:, 6:],

@@ -118,7 +118,7 @@ class StateHistory:
             return states
         (stamp, motion), last = next_motion, states[-1]
         T_wc = orthonormalise(last.T_wc @ invert(motion.T_cp))
-        return (*states, replace(last.predict(stamp), T_wc=T_wc, twist=-motion.velocity))
+        return (*states, replace(last.predict(stamp), status=last.status, T_wc=T_wc, twist=-motion.velocity))
 
 
 def _interpolate(a: CameraState, b: CameraState, stamp: float) -> CameraState:

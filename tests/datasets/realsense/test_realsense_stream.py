@@ -272,7 +272,7 @@ def test_silent_camera_is_an_input_error(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr("v3d_torch.datasets.realsense.realsense_stream._SILENCE_TIMEOUT", 0.3)
     camera = SimulatedDevice()
     monkeypatch.setattr(camera, "wait", lambda milliseconds: None)
-    with pytest.raises(InputError, match="simulated: sends no images; plug"):
+    with pytest.raises(InputError, match=r"^simulated: sends no images; plug the camera into a USB 3 port$"):
         next(iter(RealSenseStream("simulated", lambda: camera)))
     assert camera.stopped.is_set()
 

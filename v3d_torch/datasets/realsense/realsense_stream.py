@@ -119,7 +119,7 @@ class RealSenseStream:
             elif device.is_over():
                 return
             elif not device.is_connected() or time.monotonic() - last_arrival > _SILENCE_TIMEOUT:
-                raise InputError(f"{self.name}: sends no images; plug the camera into a USB 3 port and start again")
+                raise InputError(f"{self.name}: sends no images; plug the camera into a USB 3 port")
 
     def _is_stopped(self) -> bool:
         """Check whether another thread ended the iteration."""

@@ -52,6 +52,10 @@ class Message(Protocol):
 _TURN_DELAY = 1e-6
 """Time from the last frame to the transforms of the final map, seconds: tf2 ignores those of a repeated time."""
 
+_MIN_COVARIANCE = 1e-9 * torch.eye(6, dtype=torch.float64)
+"""Covariance that is added to that of a pose, metres and radians, a standard deviation of 0.03 mm: the first camera
+defines the map, so that its covariance is 0, which filters cannot invert."""
+
 TopicMessage = tuple[str, Message]
 """Topic and message."""
 
@@ -156,7 +160,7 @@ class RunMessages:
                 (frames.ODOM, frames.CAMERA),
                 odometry_frame.T_ol,
                 to_link @ state.twist,
-                pose_covariance=to_odom @ state.covariance @ to_odom.T,
+                pose_covariance=to_odom @ state.covariance @ to_odom.T + _MIN_COVARIANCE,
                 twist_covariance=to_link @ state.twist_covariance @ to_link.T,
             ),
         )
