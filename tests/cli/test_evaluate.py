@@ -91,6 +91,15 @@ def test_notes_are_printed(files: tuple[str, str]) -> None:
     assert "note: no two poses with ground truth are 10 s apart: no RPE" in call(*files, "--delta", "10").stdout
 
 
+def test_true_poses_that_are_not_finite_are_left_out_with_a_note(files: tuple[str, str]) -> None:
+    path = Path(files[0])
+    first, second, *others = path.read_text().splitlines()
+    path.write_text("\n".join([first, f"{second.split()[0]} {' '.join(7 * ['nan'])}", *others]))
+    result = call(*files)
+    assert "89 of 90 poses have ground truth" in result.stdout
+    assert "note: 1 of 90 poses of the ground truth are empty or not finite and are left out" in result.stdout
+
+
 @pytest.mark.parametrize("case", ["missing", "broken", "elsewhere", "sequence"])
 def test_bad_input_is_one_line_and_exit_code_2(case: str, files: tuple[str, str], tmp_path: Path) -> None:
     bad = tmp_path / "bad.txt"

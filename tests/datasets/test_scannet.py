@@ -71,7 +71,8 @@ def test_colour_images_without_depth_are_left_out_with_a_note(folder: Path) -> N
     sequence = load_sequence(folder)
     assert isinstance(sequence, ScanNetSequence) and len(sequence) == 2
     assert sequence.notes == [
-        "1 of 3 colour images have no depth image of the same frame number and are left out (the last is 100.png)"
+        "1 of 2 poses of the ground truth are empty or not finite and are left out",
+        "1 of 3 colour images have no depth image of the same frame number and are left out (the last is 100.png)",
     ]
 
 
@@ -132,7 +133,18 @@ def test_camera_file_beside_the_images_or_in_the_scene_is_preferred(folder: Path
 def test_sequence_without_finite_poses_has_no_ground_truth(folder: Path) -> None:
     for path in (folder / "pose").iterdir():
         path.write_text(LOST)
-    assert load_sequence(str(folder)).groundtruth is None
+    sequence = load_sequence(str(folder))
+    assert isinstance(sequence, ScanNetSequence) and sequence.groundtruth is None
+    assert sequence.notes == ["3 of 3 poses of the ground truth are empty or not finite and are left out"]
+
+
+@pytest.mark.parametrize("text", ["", " \n", *(LOST.replace("-inf", word) for word in ("-1.#INF00", "1.#QNAN", "nan"))])
+def test_empty_pose_file_or_numbers_of_windows_mark_lost_tracking(folder: Path, text: str) -> None:
+    (folder / "pose" / "100.txt").write_text(text)
+    sequence = load_sequence(str(folder))
+    assert isinstance(sequence, ScanNetSequence) and sequence.groundtruth is not None
+    assert sequence.groundtruth.stamps.tolist() == [0]
+    assert sequence.notes == ["2 of 3 poses of the ground truth are empty or not finite and are left out"]
 
 
 @pytest.mark.parametrize(

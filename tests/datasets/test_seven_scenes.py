@@ -6,11 +6,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.damaged_folders import assert_ground_truth_is_left_out
+from helpers.damaged_folders import assert_ground_truth_is_left_out, assert_rejected
 from helpers.tiny_images import as_rgb, colour_of, depth_of, save
 
 from v3d_torch.datasets import load_sequence
+from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.seven_scenes import CAMERA, SevenScenesSequence
+from v3d_torch.geometry.camera import PinholeCamera
+
+INFO = """m_versionNumber = 4
+m_sensorName = StructureSensor
+m_depthShift = 1000
+m_calibrationColorIntrinsic = {colour} 0 0 1 0 0 0 0 1
+m_calibrationDepthIntrinsic = {depth} 0 0 1 0 0 0 0 1
+"""
+"""The file of BundleFusion and 12-Scenes, without the first eight numbers of the matrices."""
 
 
 @pytest.fixture
@@ -55,3 +65,66 @@ def test_missing_and_damaged_poses_give_no_ground_truth(folder: Path) -> None:
     for path in folder.glob("*.pose.txt"):
         path.unlink()
     assert load_sequence(str(folder)).groundtruth is None
+
+
+def notes_of(folder: Path) -> list[str]:
+    sequence = load_sequence(folder)
+    assert isinstance(sequence, ImageSequence)
+    return sequence.notes
+
+
+def test_note_says_that_the_camera_of_another_data_set_is_a_guess(folder: Path) -> None:
+    other = folder.rename(folder.with_name("apt0"))
+    (note,) = notes_of(other)
+    assert note.startswith("the camera is that of 7-Scenes, with a focal length of 585 pixels; for a recording of")
+    (other / "K.txt").write_text("585 0 320\n0 585 240\n0 0 1\n")
+    assert notes_of(other) == []
+
+
+@pytest.mark.parametrize("place", ["apt0/info.txt", "apt0/_info.txt", "info.txt"])
+def test_camera_is_that_of_the_info_file(folder: Path, place: str) -> None:
+    """12-Scenes has it in the parent of the folder with the frames."""
+    other = folder.rename(folder.with_name("apt0"))
+    camera = "583 0 319 0 0 584 241 0"
+    (other.parent / place).write_text(INFO.format(colour=camera, depth=camera))
+    sequence = load_sequence(other)
+    assert sequence.camera == PinholeCamera(583, 584, 319, 241, depth_scale=1000.0)
+    assert notes_of(other) == []
+    assert np.array_equal(as_rgb(sequence[1].image), colour_of(1, 640, 480))
+
+
+def test_colour_of_another_size_is_warped_to_the_depth_camera(folder: Path) -> None:
+    for i in range(2):
+        ramp = np.broadcast_to(np.arange(1280) / 5, (960, 1280)).astype(np.uint8)
+        save(folder / f"frame-{i:06d}.color.png", np.repeat(ramp[..., None], 3, axis=-1))
+    (folder / "info.txt").write_text(
+        INFO.format(colour="1170 0 639.5 0 0 1170 479.5 0", depth="585 0 319.5 0 0 585 239.5 0")
+    )
+    image = as_rgb(load_sequence(folder)[0].image)
+    assert image.shape == (480, 640, 3)
+    assert np.abs(image[:, :, 0] - (2 * np.arange(640) + 0.5) / 5).max() < 1.5
+
+
+def test_colour_of_another_size_needs_the_info_file(folder: Path) -> None:
+    save(folder / "frame-000000.color.png", colour_of(0, 1296, 968))
+    assert_rejected(
+        folder, r"not supported without an info\.txt that states both cameras \(m_calibrationColorIntrinsic"
+    )
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth", "message"),
+    [
+        ("585 0 320 0 0 585 240 0", "585 0 320 0 0 585", "m_calibrationDepthIntrinsic is not a 4x4 matrix"),
+        ("a 0 320 0 0 585 240 0", "585 0 320 0 0 585 240 0", "m_calibrationColorIntrinsic is not a 4x4 matrix"),
+        ("585 0 320 0 0 585 240 0", "0 0 320 0 0 585 240 0", "m_calibrationDepthIntrinsic has a focal length below"),
+    ],
+)
+def test_damaged_info_file_is_rejected(folder: Path, colour: str, depth: str, message: str) -> None:
+    (folder / "info.txt").write_text(INFO.format(colour=colour, depth=depth))
+    assert_rejected(folder, message)
+
+
+def test_info_file_of_something_else_is_ignored(folder: Path) -> None:
+    (folder / "info.txt").write_text("recorded on Monday\n")
+    assert load_sequence(folder).camera == CAMERA

@@ -12,7 +12,7 @@ from evo.tools import file_interface
 from hypothesis import given
 from hypothesis import strategies as st
 
-from v3d_torch.datasets.tum_trajectory import read_trajectory, write_trajectory
+from v3d_torch.datasets.tum_trajectory import read_groundtruth, read_trajectory, write_trajectory
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.evaluation import evaluate
 from v3d_torch.geometry.se3 import se3_exp
@@ -97,6 +97,59 @@ def test_poses_are_sorted_and_first_of_equal_stamps_is_kept(tmp_path: Path) -> N
     trajectory = read_trajectory(write(tmp_path, "\n".join(lines)))
     assert trajectory.stamps.tolist() == [1, 2, 3]
     assert trajectory.T_wc[:, 0, 3].tolist() == [10, 20, 30]
+
+
+def assert_is_read_as(text: str, folder: Path) -> None:
+    """Check that a file has a pose at 1403636580.8386 s, at (1, 2, 3), turned by 90 degrees about z."""
+    trajectory = read_trajectory(write(folder, text))
+    assert trajectory.stamps.tolist() == pytest.approx([1403636580.8386])
+    assert trajectory.T_wc[0, :3].flatten().tolist() == pytest.approx([0, -1, 0, 1, 1, 0, 0, 2, 0, 0, 1, 3])
+
+
+HALF = 0.5**0.5
+EUROC = f"1403636580838600000,1,2,3,{HALF},0,0,{HALF}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z []\n{EUROC}\n",
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [],"
+        f" v_RS_R_x [m s^-1], b_w_RS_S_x [rad s^-1]\n{EUROC},9,9\n",
+        f"# made by hand\n# time qx qy qz qw px py pz\n1403636580.8386 0 0 {HALF} {HALF} 1 2 3\n",
+        f"#timestamp,tx,ty,tz,qx,qy,qz,qw\n1403636580838600000,1,2,3,0,0,{HALF},{HALF}\n",
+    ],
+)
+def test_comment_states_the_order_of_the_columns(text: str, tmp_path: Path) -> None:
+    """EuRoC and evo write the scalar of a quaternion first."""
+    assert_is_read_as(text, tmp_path)
+
+
+def test_commas_and_nanoseconds_need_a_comment_with_the_order(tmp_path: Path) -> None:
+    message = (
+        "line 1 has commas and nanoseconds as in files of EuRoC, which have qw before qx, but no comment names the"
+    )
+    with pytest.raises(InputError, match=message):
+        read_trajectory(write(tmp_path, EUROC))
+    assert_is_read_as(f"1403636580.8386,1,2,3,0,0,{HALF},{HALF}\n", tmp_path)
+    assert_is_read_as(f"1403636580838600000 1 2 3 0 0 {HALF} {HALF}\n", tmp_path)
+
+
+def test_poses_that_are_not_finite_are_missing_in_a_ground_truth(tmp_path: Path) -> None:
+    lines = [f"{stamp} {x} 0 0 0 0 0 1" for stamp, x in enumerate((1, "nan", "-1.#INF", "1.#QNAN", 5))]
+    truth = read_groundtruth(write(tmp_path, "\n".join(lines)))
+    assert truth.trajectory.stamps.tolist() == [0, 4] and truth.missing == 3
+    assert truth.note == "3 of 5 poses of the ground truth are empty or not finite and are left out"
+    with pytest.raises(InputError, match="line 1 has a number that is not finite"):
+        read_groundtruth(write(tmp_path, lines[1]))
+    with pytest.raises(InputError, match="line 2 has a number that is not finite"):
+        read_groundtruth(write(tmp_path, f"{lines[0]}\nnan 0 0 0 0 0 0 1\n"))
+
+
+def test_number_of_columns_is_in_the_error(tmp_path: Path) -> None:
+    message = "line 1 has 9 columns, expected 8: timestamp tx ty tz qx qy qz qw; remove the others"
+    with pytest.raises(InputError, match=message):
+        read_trajectory(write(tmp_path, "1 0 0 0 0 0 0 1 9\n"))
 
 
 GOOD = "# header\n1 0 0 0 0 0 0 1\n"

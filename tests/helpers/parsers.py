@@ -23,6 +23,7 @@ from v3d_torch.datasets.matrix_files import read_matrix, read_poses
 from v3d_torch.datasets.ros import BagSequence
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.encodings import COLOUR_ENCODINGS
+from v3d_torch.datasets.sensor_info import read_sensor_info
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import V3DError
 from v3d_torch.geometry.camera import PinholeCamera
@@ -103,6 +104,7 @@ PARSERS: dict[str, Parser] = {
     "gravity": from_file("gravity.txt", lambda path: read_gravity_file(path, 1.5)),
     "matrix": from_file("pose.txt", read_matrix),
     "pose": from_file("pose.txt", lambda path: read_poses({0.0: path})),
+    "info.txt": from_file("info.txt", read_sensor_info),
     "camera.yaml": from_file("camera.yaml", load_camera),
     "K.txt": from_file("K.txt", load_camera),
     "configuration": from_file("config.yaml", load_config),

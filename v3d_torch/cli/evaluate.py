@@ -41,25 +41,29 @@ def main(
 
     ATE is the absolute error of the aligned positions, RPE the relative error of the motions over a fixed time.
     """
+    from dataclasses import replace
+
     from rich.console import Console
 
     with quick_imports():
         from v3d_torch.datasets.sequence_names import find_paper_sequence
         from v3d_torch.datasets.tum_extents import describe_estimate_difference
-        from v3d_torch.datasets.tum_trajectory import read_trajectory
+        from v3d_torch.datasets.tum_trajectory import read_groundtruth, read_trajectory
         from v3d_torch.errors import InputError
         from v3d_torch.evaluation import evaluate
         from v3d_torch.evaluation.paper_tables import make_paper_table
         from v3d_torch.runs.print_line import print_line
 
     with exit_on_error():
-        truth, poses = read_trajectory(groundtruth), read_trajectory(estimate)
+        measured, poses = read_groundtruth(groundtruth), read_trajectory(estimate)
+        truth, absent = measured.trajectory, () if measured.note is None else (measured.note,)
         if sequence is not None and find_paper_sequence(sequence) is None:
             raise InputError(f"--sequence {sequence}: is not in the paper's tables; use a name such as fr3/w/xyz")
         try:
             evaluation = evaluate(truth, poses, max_time_difference=max_difference, rpe_delta=delta, frames=frames)
         except InputError as error:
             raise InputError(f"{groundtruth}, {estimate}: {error}") from error
+        evaluation = replace(evaluation, notes=(*evaluation.notes, *absent))
         if as_json:
             import json
 

@@ -12,7 +12,7 @@ from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_files import pair_by_number
 from v3d_torch.datasets.lists import ImagePair, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
-from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.datasets.tum_trajectory import read_groundtruth
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.text_file import read_text
@@ -56,7 +56,7 @@ class ICLNUIMSequence(PairedImages):
             folder,
             pairs,
             camera,
-            lambda: camera_poses(read_trajectory(groundtruth_files[0])) if groundtruth_files else None,
+            lambda: read_groundtruth(groundtruth_files[0]).convert(camera_poses) if groundtruth_files else None,
             published=lambda: CAMERA,
             pairing_note=note,
         )

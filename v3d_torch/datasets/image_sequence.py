@@ -33,6 +33,9 @@ class ImageSequence(StoredSequence):
     depth_scale_note: str | None = None
     """Sentence that reports how the depth scale was estimated; None if it is stated."""
 
+    camera_note: str | None = None
+    """Sentence that reports a camera that may be another one; None if it is certain."""
+
     pairing_note: str | None = None
     """Sentence on the pairing of colour and depth images, such as on images that are left out; None if there is nothing
     to report."""
@@ -43,7 +46,8 @@ class ImageSequence(StoredSequence):
     @property
     def notes(self) -> list[str]:
         """Sentences about the sequence that a user needs to know, such as how the depth scale was estimated."""
-        return [*super().notes, *(note for note in (self.depth_scale_note, self.pairing_note) if note is not None)]
+        notes = (self.camera_note, self.depth_scale_note, self.pairing_note)
+        return [*super().notes, *(note for note in notes if note is not None)]
 
     def check(self, source: object, *, skip_broken: bool = False) -> None:
         """Check that all files exist, and decode the first frame, so that errors are reported before a long run.

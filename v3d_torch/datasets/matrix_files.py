@@ -11,12 +11,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from v3d_torch.datasets.groundtruth import GroundTruth
 from v3d_torch.datasets.tum_trajectory import MAX_DISTANCE, ROTATION_TOLERANCE
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import are_rigid
+from v3d_torch.io.numbers import parse_number
 from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
 from v3d_torch.io.text_file import numbered_lines, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
+
+_EXPECTED = "a matrix has a line per row"
 
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
@@ -31,12 +35,9 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file cannot be read or does not contain such a matrix.
     """
-    rows = [
-        replace_odd_spaces(line).replace(",", " ").split()
-        for _, line in numbered_lines(path, "a matrix has a line per row")
-    ]
+    rows = [replace_odd_spaces(line).replace(",", " ").split() for _, line in numbered_lines(path, _EXPECTED)]
     try:
-        matrix = np.array(rows, dtype=np.float64)
+        matrix = np.array([[parse_number(word) for word in row] for row in rows], dtype=np.float64)
     except ValueError:
         matrix = np.empty(0)
     if matrix.shape not in ((3, 3), (4, 4)):
@@ -44,31 +45,36 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
     return matrix
 
 
-def read_poses(files: Mapping[float, Path]) -> Trajectory | None:
+def read_poses(files: Mapping[float, Path]) -> GroundTruth | None:
     """Read camera poses from text files with one 4x4 matrix each.
 
     Args:
         files: Pose files by timestamp (seconds), in temporal order.
 
     Returns:
-        Camera-to-world poses. Poses that are not finite mark lost tracking and are skipped; None if no pose is left.
+        Camera-to-world poses. Files that are empty, or have a pose that is not finite, mark lost tracking and are left
+        out. None without files.
 
     Raises:
         InputError: If a file does not contain a 4x4 matrix, or the matrix is not a rigid transform.
     """
     poses = {}
     for stamp, path in files.items():
-        T_wc = read_matrix(path)
-        if T_wc.shape != (4, 4):
-            raise InputError(f"{path}: is not a 4x4 pose matrix; copy it again")
-        if not np.isfinite(T_wc).all():
+        if not read_text(path, _EXPECTED).strip():
             continue
-        if np.abs(T_wc).max() > MAX_DISTANCE or not are_rigid(torch.from_numpy(T_wc), ROTATION_TOLERANCE):
+        matrix = read_matrix(path)
+        if matrix.shape != (4, 4):
+            raise InputError(f"{path}: is not a 4x4 pose matrix; copy it again")
+        if not np.isfinite(matrix).all():
+            continue
+        if np.abs(matrix).max() > MAX_DISTANCE or not are_rigid(torch.from_numpy(matrix), ROTATION_TOLERANCE):
             raise InputError(f"{path}: is not a valid rigid transform; copy it again")
-        poses[stamp] = T_wc
-    if not poses:
+        poses[stamp] = matrix
+    if not files:
         return None
-    return Trajectory(torch.tensor(list(poses), dtype=torch.float64), torch.from_numpy(np.stack(list(poses.values()))))
+    stamps = torch.tensor(list(poses), dtype=torch.float64)
+    T_wc = torch.from_numpy(np.array(list(poses.values()), dtype=np.float64).reshape(-1, 4, 4))
+    return GroundTruth(Trajectory(stamps, T_wc), missing=len(files) - len(poses))
 
 
 def read_opencv_yaml(path: Path) -> Any:

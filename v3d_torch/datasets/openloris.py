@@ -10,10 +10,11 @@ from torch import Tensor
 
 from v3d_torch.datasets.camera_fields import camera_from_fields
 from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.groundtruth import GroundTruth
 from v3d_torch.datasets.lists import pair_lists
 from v3d_torch.datasets.matrix_files import opencv_matrix, read_opencv_yaml
 from v3d_torch.datasets.paired_images import PairedImages
-from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.datasets.tum_trajectory import read_groundtruth
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_scale import MILLIMETRES
@@ -70,10 +71,10 @@ def _read_camera(path: Path) -> PinholeCamera:
     return camera_from_fields(fields, str(path))
 
 
-def _camera_poses(groundtruth: Path, calibration: Path) -> Trajectory:
+def _camera_poses(groundtruth: Path, calibration: Path) -> GroundTruth:
     """Read the poses of the robot's base and convert them to poses of its colour camera."""
-    base = read_trajectory(groundtruth)
-    return Trajectory(base.stamps, base.T_wc @ _find_transform(_BASE, _COLOUR, calibration))
+    T_base_camera = _find_transform(_BASE, _COLOUR, calibration)
+    return read_groundtruth(groundtruth).convert(lambda base: Trajectory(base.stamps, base.T_wc @ T_base_camera))
 
 
 def _find_transform(parent: str, child: str, path: Path) -> Tensor:

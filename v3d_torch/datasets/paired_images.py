@@ -11,10 +11,10 @@ from torch import Tensor
 from v3d_torch.datasets.broken_frames import first_readable
 from v3d_torch.datasets.cameras import CameraChoice, PublishedCamera, choose_camera
 from v3d_torch.datasets.depth_files import read_depth_file
+from v3d_torch.datasets.groundtruth import ReadGroundTruth
 from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.images import image_size, read_colour
 from v3d_torch.datasets.lists import ImagePair
-from v3d_torch.datasets.stored import ReadGroundTruth
 
 
 class PairedImages(ImageSequence):

@@ -5,15 +5,14 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.broken_frames import first_readable
 from v3d_torch.datasets.camera_fields import camera_from_fields, check_principal_point
 from v3d_torch.datasets.cameras import CameraChoice, camera_file
+from v3d_torch.datasets.colour_warp import scale_matrix, warp_colour
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair
@@ -75,19 +74,12 @@ class ScanNetSequence(PairedImages):
         if (width, height) == size:
             return colour
         K_depth = self.camera.K.numpy()
-        K_colour = self._K_colour if self._K_colour is not None else _scale(K_depth, width / size[0], height / size[1])
+        K_colour = (
+            self._K_colour if self._K_colour is not None else scale_matrix(K_depth, width / size[0], height / size[1])
+        )
         if self._colour_camera is not None:
             check_principal_point(K_colour[0, 2], K_colour[1, 2], (width, height), self._colour_camera)
-        # First average down to about the depth resolution, to avoid aliasing of fine texture. Then warp by fractions of
-        # a pixel, so that the pixels of both images have the same rays.
-        shrink = K_depth.diagonal()[:2] / K_colour.diagonal()[:2]
-        small_size = np.maximum(np.rint(np.array([width, height]) * shrink), 1).astype(int).tolist()
-        small = cv2.resize(colour.permute(1, 2, 0).numpy(), small_size, interpolation=cv2.INTER_AREA)
-        K_small = _scale(K_colour, small_size[0] / width, small_size[1] / height)
-        small_from_depth = (K_small @ np.linalg.inv(K_depth))[:2]
-        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        pixels = cv2.warpAffine(small, small_from_depth, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return torch.from_numpy(pixels).permute(2, 0, 1)
+        return warp_colour(colour, K_colour, K_depth, size)
 
 
 def is_scannet(path: Path) -> bool:
@@ -117,7 +109,7 @@ def _depth_camera(frames: Path, pair: ImagePair) -> PinholeCamera | None:
     if source == _intrinsics_file(frames, "color"):
         colour_size = image_size(frames / pair.colour)
         check_principal_point(K[0, 2], K[1, 2], colour_size, source)
-        K = _scale(K, width / colour_size[0], height / colour_size[1])
+        K = scale_matrix(K, width / colour_size[0], height / colour_size[1])
     fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
     return camera_from_fields(fields | {"depth_scale": _DEPTH_SCALE}, str(source))
 
@@ -130,9 +122,3 @@ def _read_camera_matrix(path: Path) -> NDArray[np.float64]:
             f"{path}: is not a camera matrix with focal lengths of at least 1 pixel on its diagonal; copy it again"
         )
     return K
-
-
-def _scale(K: NDArray[np.float64], x: float, y: float) -> NDArray[np.float64]:
-    """Scale a camera matrix to a resized image. Pixel centres are at integers, so the image begins at -0.5."""
-    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-    return np.diag([x, y, 1.0]) @ (K[:3, :3] + half) - half

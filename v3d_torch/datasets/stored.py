@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import operator
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from v3d_torch.datasets.groundtruth import ReadGroundTruth
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.types import RGBDFrame, Trajectory
-
-ReadGroundTruth = Callable[[], Trajectory | None]
-"""Function that reads the ground truth; it returns None if the sequence has none."""
 
 
 class StoredSequence(ABC):
@@ -51,16 +49,22 @@ class StoredSequence(ABC):
         self._depth_delays = delays or [0.0] * len(stamps)
         self.groundtruth: Trajectory | None = None
         self.groundtruth_error: InputError | None = None
+        self._groundtruth_note: str | None = None
         try:
-            self.groundtruth = groundtruth() if groundtruth is not None else None
+            truth = groundtruth() if groundtruth is not None else None
         except InputError as error:
             self.groundtruth_error = error
+            return
+        if truth is not None:
+            self.groundtruth = truth.trajectory if len(truth.trajectory) else None
+            self._groundtruth_note = truth.note
 
     @property
     def notes(self) -> list[str]:
         """Sentences about the sequence that a user needs to know before a run."""
-        error = self.groundtruth_error
-        return [] if error is None else [f"the ground truth cannot be read: {error}"]
+        if self.groundtruth_error is not None:
+            return [f"the ground truth cannot be read: {self.groundtruth_error}"]
+        return [] if self._groundtruth_note is None else [self._groundtruth_note]
 
     def __len__(self) -> int:
         return self.stamps.shape[0]

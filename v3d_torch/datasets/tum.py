@@ -14,7 +14,7 @@ from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
 from v3d_torch.datasets.sequence_names import folder_label
-from v3d_torch.datasets.tum_trajectory import read_trajectory
+from v3d_torch.datasets.tum_trajectory import read_groundtruth
 from v3d_torch.errors import InputError
 
 
@@ -54,7 +54,7 @@ class TUMSequence(PairedImages):
             folder,
             pairs,
             camera,
-            lambda: read_trajectory(groundtruth) if groundtruth.is_file() else None,
+            lambda: read_groundtruth(groundtruth) if groundtruth.is_file() else None,
             published=published,
             name=folder_label(folder.resolve().name) if name is None else name,
             pairing_note=note,

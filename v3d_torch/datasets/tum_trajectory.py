@@ -10,11 +10,14 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from v3d_torch.datasets.groundtruth import GroundTruth
+from v3d_torch.datasets.trajectory_columns import TUM_COLUMNS, read_header
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.files import write_text
+from v3d_torch.io.numbers import parse_number
 from v3d_torch.io.paths import StrPath
-from v3d_torch.io.text_file import numbered_lines, replace_odd_spaces
+from v3d_torch.io.text_file import lines_and_comments, replace_odd_spaces
 from v3d_torch.io.timestamps import parse_timestamp, round_timestamp
 from v3d_torch.types import Trajectory
 
@@ -27,19 +30,23 @@ ROTATION_TOLERANCE = 0.01
 _MAX_QUATERNION_NORM = 1e3
 """Maximum norm of a quaternion; its inverse is the minimum. Rounding and other scales stay within this range."""
 
-_COLUMNS = "timestamp tx ty tz qx qy qz qw"
+_COLUMNS = " ".join(TUM_COLUMNS)
+
+_MIN_NANOSECONDS = 1e18
+"""Minimum timestamp in nanoseconds since 1970, see `parse_timestamp`."""
 
 
 def read_trajectory(path: StrPath) -> Trajectory:
     """Read a trajectory in TUM format.
 
-    Comments (#), blank lines, a byte order mark, all line endings and commas between the columns are accepted.
-    Quaternions are normalised and poses are sorted by timestamp. If a timestamp, rounded to 6 decimals, occurs more
-    than once, the first line is used.
+    Comments (#), blank lines, a byte order mark, all line endings and commas between the columns are accepted. A
+    comment that names the columns states their order, such as that of EuRoC and evo, whose quaternions begin with the
+    scalar. Quaternions are normalised and poses are sorted by timestamp. If a timestamp, rounded to 6 decimals, occurs
+    more than once, the first line is used.
 
     Args:
-        path: Path of a file with lines of ``timestamp tx ty tz qx qy qz qw``: seconds, metres, and a quaternion with
-            the scalar last.
+        path: Path of a file with lines of ``timestamp tx ty tz qx qy qz qw``, or as a comment names them: seconds,
+            metres, and a quaternion with the scalar last.
 
     Returns:
         Camera-to-world poses with timestamps in seconds. Convention: ``T_wc`` maps camera to world.
@@ -48,6 +55,34 @@ def read_trajectory(path: StrPath) -> Trajectory:
         InputError: If the file cannot be read, contains no poses, or contains an invalid line.
     """
     line_numbers, poses = _parse(Path(path))
+    return _to_trajectory(path, line_numbers, poses)
+
+
+def read_groundtruth(path: StrPath) -> GroundTruth:
+    """Read the ground truth of a sequence, in TUM format; poses that are not finite are left out.
+
+    Some tracking systems write such poses while they do not see the camera.
+
+    Args:
+        path: As for `read_trajectory`.
+
+    Returns:
+        Ground truth with at least one pose.
+
+    Raises:
+        InputError: As `read_trajectory`, but only if a timestamp or all poses are not finite.
+    """
+    line_numbers, poses = _parse(Path(path))
+    is_measured = np.isfinite(poses[:, 1:]).all(axis=1)
+    if not is_measured.any():
+        is_measured = np.ones(len(poses), np.bool_)  # the error has the first line
+    return GroundTruth(
+        _to_trajectory(path, line_numbers[is_measured], poses[is_measured]), missing=int((~is_measured).sum())
+    )
+
+
+def _to_trajectory(path: StrPath, line_numbers: NDArray[np.int64], poses: NDArray[np.float64]) -> Trajectory:
+    """Check the lines of a file and convert them to poses, see `read_trajectory`."""
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(poses[:, 4:], axis=1)
     for invalid, cause in (
@@ -109,19 +144,43 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
     write_text(Path(path), "".join(lines))
 
 
-def _parse(path: Path) -> tuple[list[int], NDArray[np.float64]]:
-    """Parse a file to line numbers, counted from 1, and the eight columns of each line, shape (N, 8)."""
+def _parse(path: Path) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Parse a file to line numbers, counted from 1, shape (N,), and the columns of `TUM_COLUMNS`, shape (N, 8)."""
     line_numbers, poses = [], []
-    for number, line in numbered_lines(path, f"a trajectory has lines of {_COLUMNS}"):
-        words = replace_odd_spaces(line).replace(",", " ").split()
-        try:
-            pose = [parse_timestamp(word) for word in words[:1]] + [float(word) for word in words[1:]]
-        except ValueError:
-            pose = []
-        if len(pose) != len(_COLUMNS.split()):
-            raise InputError(f"{path}: line {number} is {line[:80]!r}, expected {_COLUMNS}; correct or remove it")
+    header = None
+    for number, line in lines_and_comments(path, f"a trajectory has lines of {_COLUMNS}"):
+        if line.startswith("#"):
+            header = read_header(line) or header
+            continue
         line_numbers.append(number)
-        poses.append(pose)
+        poses.append(_parse_line(line, header, f"{path}: line {number}"))
     if not poses:
         raise InputError(f"{path}: contains no poses; copy it again, it must have lines of {_COLUMNS}")
-    return line_numbers, np.array(poses, dtype=np.float64)
+    return np.array(line_numbers), np.array(poses, dtype=np.float64)
+
+
+def _parse_line(line: str, header: list[str] | None, place: str) -> list[float]:
+    """Parse a line to the columns of `TUM_COLUMNS`.
+
+    Args:
+        line: Line of the file.
+        header: Names of its columns; None for those of the TUM format.
+        place: File and number of the line, for messages.
+    """
+    words = replace_odd_spaces(line).replace(",", " ").split()
+    columns = header or list(TUM_COLUMNS)
+    if len(words) > len(columns):
+        raise InputError(
+            f"{place} has {len(words)} columns, expected {len(columns)}: {' '.join(columns)}; remove the others"
+        )
+    try:
+        by_name = dict(zip(columns, words, strict=True))
+        pose = [parse_timestamp(by_name["timestamp"]), *(parse_number(by_name[name]) for name in TUM_COLUMNS[1:])]
+    except ValueError as error:
+        raise InputError(f"{place} is {line[:80]!r}, expected {' '.join(columns)}; correct or remove it") from error
+    if header is None and "," in line and float(by_name["timestamp"]) >= _MIN_NANOSECONDS:
+        raise InputError(
+            f"{place} has commas and nanoseconds as in files of EuRoC, which have qw before qx, but no comment names"
+            f" the columns; write them in their order above the first pose, such as # {_COLUMNS}"
+        )
+    return pose

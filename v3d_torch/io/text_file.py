@@ -59,8 +59,21 @@ def numbered_lines(path: Path, expected: str) -> Iterator[tuple[int, str]]:
     Raises:
         InputError: As `read_text`.
     """
+    return ((number, line) for number, line in lines_and_comments(path, expected) if not line.startswith("#"))
+
+
+def lines_and_comments(path: Path, expected: str) -> Iterator[tuple[int, str]]:
+    """Yield the line number (from 1) and the stripped text of each line that is not empty.
+
+    Args:
+        path: File to read.
+        expected: Expected content, for error messages, see `read_text`.
+
+    Raises:
+        InputError: As `read_text`.
+    """
     for number, line in enumerate(read_text(path, expected).split("\n"), start=1):
-        if (line := line.strip()) and not line.startswith("#"):
+        if line := line.strip():
             yield number, line
 
 
