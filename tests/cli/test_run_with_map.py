@@ -157,6 +157,7 @@ def test_unwritable_map_file_is_rejected_before_the_run(halves: tuple[Path, Path
     ("option", "words"),
     [
         ("seq/groundtruth.txt", "exists and is not a map"),
+        ("room.ply", "would contain no point cloud, which is map.ply of the results"),
         ("out/metrics.json", "is a result of the run"),
         ("out/masks/1.png", "is a result of the run"),
         ("out/../out/run.log", "is a result of the run"),

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from v3d_torch.datasets.locate import check_name
 from v3d_torch.datasets.sequence_names import (
     PAPER_SEQUENCES,
     SEQUENCES,
@@ -15,6 +18,7 @@ from v3d_torch.datasets.sequence_names import (
     folder_label,
     short_name,
 )
+from v3d_torch.errors import InputError
 
 
 @pytest.mark.parametrize("name", SEQUENCES)
@@ -106,3 +110,18 @@ def test_download_url_is_that_of_the_benchmark() -> None:
     assert (
         download_url("rgbd_dataset_freiburg3_walking_xyz") == f"{base}/freiburg3/rgbd_dataset_freiburg3_walking_xyz.tgz"
     )
+
+
+def test_unknown_name_suggests_folders_beside_it_and_in_the_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in ("here/kitchen", "data/corridor"):
+        (tmp_path / folder).mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    for name, expected in (
+        ("kichen", "kitchen"),
+        (f"{tmp_path}/here/kitchn", f"{tmp_path}/here/kitchen"),
+        ("coridor", "corridor"),
+    ):
+        with pytest.raises(InputError, match=rf"did you mean {expected}( or|\?)"):
+            check_name(name, tmp_path / "data")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
+from dataclasses import replace
 from io import StringIO
 from typing import Any
 
@@ -268,3 +269,12 @@ def test_tables_read_each_outcome_a_fixed_number_of_times() -> None:
         return reads / len(outcomes)
 
     assert reads_per_outcome(32) < 1.5 * reads_per_outcome(2)
+
+
+def test_notes_and_missing_scores_are_listed() -> None:
+    (scored,) = runs("room", "full", 0.1)
+    noted = replace(scored, metrics={**scored.metrics, "notes": ["aligned by the orientations"]})
+    unscored = Outcome("attic", "full", 0, {"diagnosis": "attic: the depth images are empty"})
+    document = format_markdown([noted, unscored])
+    assert "## Notes\n\n- room, full, seed 0: aligned by the orientations\n" in document
+    assert "## Not scored\n\n- attic, full, seed 0: attic: the depth images are empty\n" in document

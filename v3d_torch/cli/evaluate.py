@@ -93,7 +93,7 @@ def _error_table(evaluation: Evaluation) -> Table:
     if (rpe := evaluation.rpe) is not None:
         delta = "s" if rpe.delta == 1 else f"{rpe.delta:g} s"
         rows |= {f"RPE, m/{delta}": rpe.trans, f"RPE, deg/{delta}": rpe.rot}
-    table = Table(title=f"{evaluation.pairs} of {evaluation.poses} poses have ground truth{coverage}")
+    table = Table(title=f"{evaluation.pairs_text}{coverage}")
     table.add_column("error")
     for field in fields(Statistics):
         table.add_column(field.name, justify="right")

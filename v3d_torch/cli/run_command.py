@@ -381,6 +381,8 @@ def _summary_table(
     if evaluation is not None:
         coverage = "" if evaluation.coverage is None else f" (coverage {format_coverage(evaluation.coverage)})"
         table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m{coverage}")
+        if evaluation.pairs < evaluation.poses:
+            table.add_row("scored", evaluation.pairs_text)
         if evaluation.rpe is not None:
             table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
     if (masks := record.mask_evaluation.compute_scores()) is not None:

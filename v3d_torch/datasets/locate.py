@@ -48,7 +48,7 @@ def find_or_download(name: str, *, data_root: Path | None, download: bool, progr
         return found
     full_name, folder = canonical_name(name), data_folder(data_root)
     if full_name is None:
-        raise unknown_name_error(name)
+        raise unknown_name_error(name, _stored_folders(name, data_root))
     install = f"unpack it and move the folder {full_name} to {folder}"
     if not download:
         raise InputError(f"{short_name(full_name)}: is not in {folder}; download {download_url(full_name)}, {install}")
@@ -78,7 +78,7 @@ def check_name(name: str, data_root: Path | None) -> None:
     """
     with suppress(OSError):  # such as a name that is too long; `open_source` reports the error
         if not _is_special(name) and canonical_name(name) is None and find_stored(name, data_root) is None:
-            raise unknown_name_error(name)
+            raise unknown_name_error(name, _stored_folders(name, data_root))
 
 
 def find_stored(name: str, data_root: Path | None) -> Path | None:
@@ -140,6 +140,15 @@ def _find(root: Path, name: str, full_name: str | None) -> Path | None:
         return None
     folders = (entry for entry in sorted(root.iterdir()) if canonical_name(entry.name) == full_name)
     return next((folder for folder in folders if folder.is_dir()), None)
+
+
+def _stored_folders(name: str, data_root: Path | None) -> list[str]:
+    """Return the paths of the folders beside a path, and the names of those with the user's sequences."""
+    folders: list[str] = []
+    for root, prefix in ((expand_user(name).parent, Path(name).parent), (data_folder(data_root), Path())):
+        with suppress(OSError):  # there is no such folder, or it cannot be read
+            folders += [str(prefix / entry.name) for entry in sorted(root.iterdir()) if entry.is_dir()]
+    return folders
 
 
 def _download(full_name: str, root: Path, progress: Progress | None) -> Path:

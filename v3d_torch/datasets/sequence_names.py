@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Iterable
+from pathlib import PurePath
 
 from v3d_torch.errors import InputError
 
@@ -154,13 +156,21 @@ def download_url(full_name: str) -> str:
     return f"https://cvg.cit.tum.de/rgbd/dataset/{camera}/{full_name}.tgz"
 
 
-def unknown_name_error(name: str) -> InputError:
-    """Create the error for a name that is not a path or a sequence; it suggests similar names."""
+def unknown_name_error(name: str, folders: Iterable[str]) -> InputError:
+    """Create the error for a name that is not a path or a sequence; it suggests similar names.
+
+    Args:
+        name: Name as it was given.
+        folders: Names and paths of folders that could be meant.
+    """
     choices = {short_name(full): full for full in SEQUENCES}
     spellings = {spelling: short for short, full in choices.items() for spelling in (short, full)}
     spellings |= {name: name for name in BUILT_IN_SEQUENCES}
     similar = difflib.get_close_matches(name.strip().lower(), spellings, n=3, cutoff=0.5)
-    suggestions = list(dict.fromkeys(spellings[spelling] for spelling in similar)) or ["demo", "fr3/w/xyz"]
+    last = PurePath(name).name
+    near = [folder for folder in folders if difflib.get_close_matches(last, [PurePath(folder).name], cutoff=0.75)]
+    names = list(dict.fromkeys([*near, *(spellings[spelling] for spelling in similar)]))[:3]
     return InputError(
-        f"{name}: is not a file, a folder or the name of a sequence; did you mean {' or '.join(suggestions)}?"
+        f"{name}: is not a file, a folder or the name of a sequence; did you mean"
+        f" {' or '.join(names or ['demo', 'fr3/w/xyz'])}?"
     )

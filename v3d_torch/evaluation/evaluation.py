@@ -54,6 +54,11 @@ class Evaluation:
     alignment: Alignment
     notes: tuple[str, ...]
 
+    @property
+    def pairs_text(self) -> str:
+        """Number of the poses with ground truth, in words."""
+        return f"{self.pairs} of {self.poses} poses have ground truth"
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON, nested by attribute: ``["ate"]["rmse"]``, ``["rpe"]["trans"]["rmse"]`` etc."""
         return {

@@ -41,6 +41,11 @@ class Outcome:
         return list(self.metrics.get("warnings", ()))
 
     @property
+    def notes(self) -> list[str]:
+        """Sentences on the scores, such as on an alignment by orientations or on missing scores."""
+        return list(self.metrics.get("notes", ()))
+
+    @property
     def diagnosis(self) -> str | None:
         """Cause of incomplete results, such as a camera that was not found in any frame; None if there is none."""
         diagnosis: str | None = self.metrics.get("diagnosis")
@@ -61,7 +66,7 @@ class Outcome:
 
     def __str__(self) -> str:
         ate = self.get_metric("ate.rmse")
-        cause = self.diagnosis or "; ".join(self.metrics.get("notes", ())) or "no ground truth, not scored"
+        cause = self.diagnosis or "; ".join(self.notes) or "no ground truth, not scored"
         score = f"ATE {ate:.4f} m" if ate is not None else cause
         if self.difference is not None:
             score += f" ({self.difference})"

@@ -69,7 +69,7 @@ def make_ratio_tables(outcomes: Sequence[Outcome]) -> list[ErrorTable]:
 
 
 def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> str:
-    """Return a Markdown document with all tables, the warnings of the runs, and the runs that failed.
+    """Return a Markdown document with all tables, notes and warnings of the runs, and the runs without scores.
 
     See `make_error_tables` and `make_ratio_tables`.
     """
@@ -81,10 +81,16 @@ def format_markdown(outcomes: Sequence[Outcome], absent: Sequence[str] = ()) -> 
     if ratios := make_ratio_tables(outcomes):
         lines += [line for table in ratios for line in format_markdown_table(table)]
         lines += ["", RATIO_LEGEND]
-    warnings = [f"- {outcome.run}: {warning}" for outcome in outcomes for warning in outcome.warnings]
-    lines += ["", "## Warnings", "", *warnings] if warnings else []
-    failed = [f"- {outcome}" for outcome in outcomes if outcome.failure is not None]
-    lines += ["", "## Failed", "", *failed] if failed else []
+    scored = [outcome for outcome in outcomes if outcome.get_metric("ate.rmse") is not None]
+    complete = [outcome for outcome in outcomes if outcome.failure is None]
+    sections = {
+        "Notes": [f"- {outcome.run}: {note}" for outcome in scored for note in outcome.notes],
+        "Warnings": [f"- {outcome.run}: {warning}" for outcome in outcomes for warning in outcome.warnings],
+        "Not scored": [f"- {outcome}" for outcome in complete if outcome.get_metric("ate.rmse") is None],
+        "Failed": [f"- {outcome}" for outcome in outcomes if outcome.failure is not None],
+    }
+    for title, entries in sections.items():
+        lines += ["", f"## {title}", "", *entries] if entries else []
     return "\n".join(lines) + "\n"
 
 

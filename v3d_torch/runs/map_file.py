@@ -8,6 +8,7 @@ from pathlib import Path
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.io.array_file import open_array_file
 from v3d_torch.mapping.map_io import MAP_FORMAT
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.result_folder import is_result
 
 
@@ -32,8 +33,14 @@ def check_map_path(path: Path, folder: Path | None) -> None:
         folder: Folder of the results of the run; None if it is not known yet.
 
     Raises:
-        OutputError: If the path has the name of a result in the folder, or is that of a file other than a map.
+        OutputError: If the path has the name of a point cloud or of a result in the folder, or is that of a file other
+            than a map.
     """
+    if path.suffix.lower() == ".ply":
+        raise OutputError(
+            f"{path}: would contain no point cloud, which is {RunFile.MAP} of the results; choose another file with"
+            " --save-map, such as room.npz"
+        )
     if folder is not None and is_result(path, folder):
         raise OutputError(f"{path}: is a result of the run; choose another file with --save-map")
     with suppress(OSError):
