@@ -199,7 +199,7 @@ def test_moved_sequence_is_given_with_seq(results: Path, sequence: Path, tmp_pat
     moved = (copy / "request.yaml").read_text().replace("/walk", "/gone")
     (copy / "request.yaml").write_text(moved)
     arguments = (copy, "--format", "nerfstudio", "--every", "6", "--out")
-    gone = sequence.with_name("gone")
+    gone = results.with_name("gone")
     expected = f"{gone}: the sequence of the run in {copy} is not there; give its new place with --seq"
     assert_error_line(call(*arguments, tmp_path / "a"), expected)
     assert call(*arguments, tmp_path / "b", "--seq", sequence).exit_code == 0

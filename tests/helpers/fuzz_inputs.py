@@ -167,6 +167,11 @@ _YAML = (
     b"seed: 3\nobjects:\n  voting: {distance_threshold: 0.1, time_spans: [0.0, 0.3]}\ncheckpoint: {interval: .inf}\n"
 )
 
+_INFO = b"""m_depthShift = 1000.000000
+m_calibrationColorIntrinsic = 1170.2 0 647.7 0 0 1170.2 483.7 0 0 0 1 0 0 0 0 1
+m_calibrationDepthIntrinsic = 572.0 0 320.0 0 0 572.0 240.0 0 0 0 1 0 0 0 0 1
+"""
+
 SEEDS: dict[str, list[bytes]] = {
     "image list": [_LIST],
     "associations": [b"1.5 rgb/1.png 1.51 depth/1.png\n2 rgb/a 2.png 2.0 depth/a, b.png\n"],
@@ -191,6 +196,7 @@ SEEDS: dict[str, list[bytes]] = {
     "compressed depth message": [bytes([i]) + struct.pack("<iff", 0, 1.0, 0.0) + _PNGS[-1] for i in (2, 3)]
     + [b"\1" + _PNGS[-1]],
     "sensors.yaml": [_SENSORS],
+    "info.txt": [_INFO],
     "trans_matrix.yaml": [_LINKS],
     "ROS 1 bag": [_bag("bag")],
     "ROS 2 bag": [_bag("db3")],
