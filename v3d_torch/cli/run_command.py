@@ -27,7 +27,7 @@ from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import load_map
 from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
-from v3d_torch.runs.checkpoint import Checkpoint, check_not_live, describe_change, is_finished, read_checkpoint
+from v3d_torch.runs.checkpoint import Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
 from v3d_torch.runs.map_file import check_map_path
@@ -152,7 +152,6 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
     Raises:
         V3DError: If there is no checkpoint, if the run was live, if an option conflicts with it, or as for `start_run`.
     """
-    check_not_live(folder)
     if is_finished(folder):
         print_line(Console(soft_wrap=True), f"{folder}: the run is finished; nothing to resume")
         return

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from v3d_torch.config.validation import first_error, similar_key, to_float
@@ -101,6 +104,24 @@ def camera_from_fields(fields: Mapping[Any, Any], source: str) -> PinholeCamera:
             f" {camera.width}x{camera.height} image; correct cx and cy, or width and height"
         )
     return camera
+
+
+def camera_from_matrix(
+    K: NDArray[np.float64], size: tuple[int, int], depth_scale: float | None, source: Path
+) -> PinholeCamera:
+    """Create a camera without distortion from a camera matrix.
+
+    Args:
+        K: Camera matrix, shape (3, 3) or (4, 4).
+        size: Width and height of the images.
+        depth_scale: Depth units per metre; None if they are not stated.
+        source: File of the matrix, for messages.
+
+    Raises:
+        InputError: As `camera_from_fields`.
+    """
+    fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": size[0], "height": size[1]}
+    return camera_from_fields(fields | {"depth_scale": depth_scale}, str(source))
 
 
 def _describe(error: ValidationError) -> str:

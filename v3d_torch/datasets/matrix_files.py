@@ -17,10 +17,8 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.numbers import parse_number
 from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
-from v3d_torch.io.text_file import numbered_lines, read_text, replace_odd_spaces
+from v3d_torch.io.text_file import lines_and_comments, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
-
-_EXPECTED = "a matrix has a line per row"
 
 
 def read_matrix(path: Path) -> NDArray[np.float64]:
@@ -35,7 +33,16 @@ def read_matrix(path: Path) -> NDArray[np.float64]:
     Raises:
         InputError: If the file cannot be read or does not contain such a matrix.
     """
-    rows = [replace_odd_spaces(line).replace(",", " ").split() for _, line in numbered_lines(path, _EXPECTED)]
+    return _to_matrix(path, _read_lines(path))
+
+
+def _read_lines(path: Path) -> list[str]:
+    return [line for _, line in lines_and_comments(path, "a matrix has a line per row")]
+
+
+def _to_matrix(path: Path, lines: list[str]) -> NDArray[np.float64]:
+    """Convert the lines of a file to a square matrix, see `read_matrix`."""
+    rows = [replace_odd_spaces(line).replace(",", " ").split() for line in lines if not line.startswith("#")]
     try:
         matrix = np.array([[parse_number(word) for word in row] for row in rows], dtype=np.float64)
     except ValueError:
@@ -60,9 +67,9 @@ def read_poses(files: Mapping[float, Path]) -> GroundTruth | None:
     """
     poses = {}
     for stamp, path in files.items():
-        if not read_text(path, _EXPECTED).strip():
+        if not (lines := _read_lines(path)):
             continue
-        matrix = read_matrix(path)
+        matrix = _to_matrix(path, lines)
         if matrix.shape != (4, 4):
             raise InputError(f"{path}: is not a 4x4 pose matrix; copy it again")
         if not np.isfinite(matrix).all():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.broken_frames import first_readable
-from v3d_torch.datasets.camera_fields import camera_from_fields, check_principal_point
+from v3d_torch.datasets.camera_fields import camera_from_matrix, check_principal_point
 from v3d_torch.datasets.cameras import CameraChoice, camera_file
 from v3d_torch.datasets.colour_warp import scale_matrix, warp_colour
 from v3d_torch.datasets.image_files import frame_number, list_images, pair_by_number
@@ -110,8 +110,7 @@ def _depth_camera(frames: Path, pair: ImagePair) -> PinholeCamera | None:
         colour_size = image_size(frames / pair.colour)
         check_principal_point(K[0, 2], K[1, 2], colour_size, source)
         K = scale_matrix(K, width / colour_size[0], height / colour_size[1])
-    fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
-    return camera_from_fields(fields | {"depth_scale": _DEPTH_SCALE}, str(source))
+    return camera_from_matrix(K, (width, height), _DEPTH_SCALE, source)
 
 
 def _read_camera_matrix(path: Path) -> NDArray[np.float64]:

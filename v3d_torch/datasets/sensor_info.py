@@ -36,28 +36,35 @@ class SensorInfo:
     depth_scale: float | None
 
 
-def find_sensor_info(folder: Path) -> Path | None:
-    """Return the file that states the cameras of the frames in a folder; None if there is none.
+def find_sensor_info(folder: Path) -> SensorInfo | None:
+    """Read the file that states the cameras of the frames in a folder; None if there is none.
 
     It is in the folder itself, or in its parent: 12-Scenes has the frames in a subfolder ``data``.
 
     Raises:
-        InputError: If a file with the name of such a file cannot be read.
+        InputError: As `read_sensor_info`.
     """
     files = (above / name for above in (folder, folder.resolve().parent) for name in _NAMES)
-    return next((file for file in files if file.is_file() and _DEPTH in _read_values(file)), None)
+    found = (read_sensor_info(file) for file in files if file.is_file())
+    return next((info for info in found if info is not None), None)
 
 
-def read_sensor_info(path: Path) -> SensorInfo:
+def read_sensor_info(path: Path) -> SensorInfo | None:
     """Read the cameras of a recording.
 
     Args:
-        path: File from `find_sensor_info`.
+        path: Text file.
+
+    Returns:
+        Cameras; None if the file has another content.
 
     Raises:
-        InputError: If the file cannot be read, or lacks a camera matrix with focal lengths of at least 1 pixel.
+        InputError: If the file cannot be read, or one of its camera matrices is missing or has focal lengths below 1
+            pixel.
     """
     values = _read_values(path)
+    if _DEPTH not in values:
+        return None
     shift = values.get(_SHIFT)
     try:
         depth_scale = None if shift is None else float(shift)

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from v3d_torch.datasets.broken_frames import first_readable
-from v3d_torch.datasets.camera_fields import camera_from_fields, check_principal_point
+from v3d_torch.datasets.camera_fields import camera_from_matrix, check_principal_point
 from v3d_torch.datasets.cameras import CameraChoice, camera_file
 from v3d_torch.datasets.colour_warp import warp_colour
 from v3d_torch.datasets.image_files import pair_by_number
@@ -18,7 +18,7 @@ from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair
 from v3d_torch.datasets.matrix_files import read_poses
 from v3d_torch.datasets.paired_images import PairedImages
-from v3d_torch.datasets.sensor_info import SensorInfo, find_sensor_info, read_sensor_info
+from v3d_torch.datasets.sensor_info import SensorInfo, find_sensor_info
 from v3d_torch.geometry.camera import PinholeCamera
 
 CAMERA = PinholeCamera(585.0, 585.0, 320.0, 240.0, depth_scale=1000.0)
@@ -53,8 +53,7 @@ class SevenScenesSequence(PairedImages):
     def __init__(self, folder: Path, camera: CameraChoice = None) -> None:
         pairs, note = pair_by_number(folder, folder.glob("frame-*.color.*"), folder.glob("frame-*.depth.*"), _RATE)
         pose_files = {pair.stamp: folder / f"{pair.colour.split('.')[0]}.pose.txt" for pair in pairs}
-        path = find_sensor_info(folder)
-        self._info = info = None if path is None else read_sensor_info(path)
+        self._info = info = find_sensor_info(folder)
         super().__init__(
             folder,
             pairs,
@@ -98,8 +97,6 @@ def _is_original(folder: Path, pair: ImagePair) -> bool:
 
 def _depth_camera(folder: Path, info: SensorInfo, pair: ImagePair) -> PinholeCamera:
     """Camera of the depth images according to ``info.txt``."""
-    width, height = image_size(folder / pair.depth)
-    K = info.K_depth
-    check_principal_point(K[0, 2], K[1, 2], (width, height), info.path)
-    fields = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": width, "height": height}
-    return camera_from_fields(fields | {"depth_scale": info.depth_scale}, str(info.path))
+    size = image_size(folder / pair.depth)
+    check_principal_point(info.K_depth[0, 2], info.K_depth[1, 2], size, info.path)
+    return camera_from_matrix(info.K_depth, size, info.depth_scale, info.path)

@@ -18,7 +18,7 @@ from v3d_torch.io.files import write_text
 from v3d_torch.io.numbers import parse_number
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.text_file import lines_and_comments, replace_odd_spaces
-from v3d_torch.io.timestamps import parse_timestamp, round_timestamp
+from v3d_torch.io.timestamps import MIN_NANOSECONDS, parse_timestamp, round_timestamp
 from v3d_torch.types import Trajectory
 
 MAX_DISTANCE = 1e7
@@ -31,9 +31,6 @@ _MAX_QUATERNION_NORM = 1e3
 """Maximum norm of a quaternion; its inverse is the minimum. Rounding and other scales stay within this range."""
 
 _COLUMNS = " ".join(TUM_COLUMNS)
-
-_MIN_NANOSECONDS = 1e18
-"""Minimum timestamp in nanoseconds since 1970, see `parse_timestamp`."""
 
 
 def read_trajectory(path: StrPath) -> Trajectory:
@@ -178,7 +175,7 @@ def _parse_line(line: str, header: list[str] | None, place: str) -> list[float]:
         pose = [parse_timestamp(by_name["timestamp"]), *(parse_number(by_name[name]) for name in TUM_COLUMNS[1:])]
     except ValueError as error:
         raise InputError(f"{place} is {line[:80]!r}, expected {' '.join(columns)}; correct or remove it") from error
-    if header is None and "," in line and float(by_name["timestamp"]) >= _MIN_NANOSECONDS:
+    if header is None and "," in line and float(by_name["timestamp"]) >= MIN_NANOSECONDS:
         raise InputError(
             f"{place} has commas and nanoseconds as in files of EuRoC, which have qw before qx, but no comment names"
             f" the columns; write them in their order above the first pose, such as # {_COLUMNS}"

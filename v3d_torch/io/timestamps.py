@@ -6,7 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-_UNITS_SINCE_1970 = ((1e18, 1e9), (1e15, 1e6), (1e12, 1e3))
+MIN_NANOSECONDS = 1e18
+"""Smallest number that is taken for nanoseconds since 1970."""
+
+_UNITS_SINCE_1970 = ((MIN_NANOSECONDS, 1e9), (1e15, 1e6), (1e12, 1e3))
 """Smallest value of nanosecond, microsecond and millisecond counts since 1970, and their units per second.
 
 As seconds since 1970, all these values are more than thirty thousand years ahead.

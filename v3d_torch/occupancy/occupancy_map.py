@@ -173,10 +173,10 @@ class OccupancyMap:
         radius = to_float(radius)
         if not (math.isfinite(radius) and radius >= 0):
             raise InputError(f"the radius of balls is {radius} m; give a finite radius of at least 0")
-        check_shape("points", points, "*", 3)
+        rows = _rows(points)
         if 2 * radius > self._smallest_extent():  # such a ball touches unknown space; its voxels could be too many
             return torch.zeros(points.shape[:-1], dtype=torch.bool)
-        free = are_balls_free(self.blocks, _rows(points), radius, self.config.voxel_size).reshape(points.shape[:-1])
+        free = are_balls_free(self.blocks, rows, radius, self.config.voxel_size).reshape(points.shape[:-1])
         # Centres that are not finite, or too far away for integers, touch no voxel.
         return free & (self.states(points) == VoxelState.FREE)
 

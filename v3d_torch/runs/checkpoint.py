@@ -129,21 +129,15 @@ def is_finished(folder: Path) -> bool:
     """Check whether the run in a folder reached the end of its sequence and wrote its results.
 
     Raises:
-        InputError: If its ``metrics.json`` is damaged.
+        InputError: If its ``metrics.json`` is damaged, or that of a live run, whose frames are gone.
     """
     path = folder / RunFile.METRICS
-    return path.is_file() and read_metrics(path).failure is None
-
-
-def check_not_live(folder: Path) -> None:
-    """Check that the results in a folder are not those of a live run, whose frames are gone.
-
-    Raises:
-        InputError: If they are, or if its ``metrics.json`` is damaged.
-    """
-    path = folder / RunFile.METRICS
-    if path.is_file() and read_metrics(path).latency is not None:
+    if not path.is_file():
+        return False
+    metrics = read_metrics(path)
+    if metrics.latency is not None:
         raise InputError(f"{folder}: a live run cannot be resumed; its results are in this folder")
+    return metrics.failure is None
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
