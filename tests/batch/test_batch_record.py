@@ -13,6 +13,7 @@ from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.config import Config
 from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.runs.request import RunRequest
 
 RESULTS_PAGE = Path(v3d_torch.__file__).parents[1] / "docs" / "results.md"
 
@@ -26,7 +27,7 @@ def test_documentation_lists_every_column_of_the_table_of_runs(tmp_path: Path) -
 
 
 def test_table_of_runs_has_each_warning_in_its_own_line(tmp_path: Path) -> None:
-    job = Job("room", "room", 1, "", None, "full", Config(), tmp_path / "room" / "full" / "seed0")
+    job = Job("room", 1, "", "full", RunRequest("room", Config()), tmp_path / "room" / "full" / "seed0")
     metrics = {"warnings": ["the depth seems to be late", "red and blue seem to be swapped"]}
     write_runs(tmp_path / "runs.parquet", [(job, Outcome("room", "full", 0, metrics)), (job, job.make_outcome("lost"))])
     written = pq.read_table(tmp_path / "runs.parquet")["warnings"].to_pylist()
@@ -35,7 +36,7 @@ def test_table_of_runs_has_each_warning_in_its_own_line(tmp_path: Path) -> None:
 
 def test_sequence_of_the_newest_outcome_is_last(tmp_path: Path) -> None:
     jobs = [
-        Job(name, name, 1, "", None, config, Config(), tmp_path / name / config / "seed0")
+        Job(name, 1, "", config, RunRequest(name, Config()), tmp_path / name / config / "seed0")
         for name in ("attic", "cellar", "hall")
         for config in ("full", "paper")
     ]

@@ -12,6 +12,8 @@ from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import ConfigError
+from v3d_torch.runs.open_sequences import OpenedSequence
+from v3d_torch.runs.request import RunRequest
 
 
 def test_load_configs_drops_repetitions_and_limits_threads(tmp_path: Path) -> None:
@@ -52,8 +54,9 @@ def test_configuration_with_a_seed_is_rejected_by_its_file(tmp_path: Path) -> No
 def test_jobs_store_the_folder_of_the_variable_for_other_machines(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sequences = {"own": ("own", load_sequence(str(write_walker(tmp_path / "own", 2))))}
+    sequence = load_sequence(str(write_walker(tmp_path / "own", 2)))
     configs = load_configs(["baseline"], one_thread=True)
     monkeypatch.setenv("V3D_DATA", str(tmp_path))
-    [job] = plan_jobs(sequences, configs, seeds=1, data_root=None, folder=tmp_path / "out")
-    assert (job.source, job.data_root) == ("own", tmp_path)
+    sequences = {"own": OpenedSequence(RunRequest("own", load_config()), sequence)}
+    [job] = plan_jobs(sequences, configs, seeds=1, folder=tmp_path / "out")
+    assert (job.request.seq, job.request.data_root) == ("own", str(tmp_path))

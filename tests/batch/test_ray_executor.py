@@ -73,7 +73,7 @@ def test_results_on_cluster_with_a_stage_of_the_configuration_are_identical_to_l
     assert table["seed"].tolist() == [0] and (table["tracked"] == 6).all()
     (job,) = plan_seeds(moment, tmp_path / "local", seeds=1)
     config = single_threaded(load_config(tmp_path / "lab.yaml"))
-    assert run_job(replace(job, config=config), lambda frames: None) is None
+    assert run_job(replace(job, request=replace(job.request, config=config)), lambda frames: None) is None
     remote = tmp_path / "cluster" / "moment" / "lab" / "seed0"
     for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "config.yaml"):
         assert (remote / name).read_bytes() == (job.folder / name).read_bytes(), name

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from helpers.batches import plan_seeds, repeat_sequence
 
+from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.result_folder import lock_results
@@ -28,6 +29,11 @@ def stop_after(frames: int) -> tuple[list[int], Callable[[int], None]]:
     return progress, report
 
 
+def with_values(job: Job, **values: object) -> Job:
+    """Return a job whose configuration has other values."""
+    return replace(job, request=replace(job.request, config=job.config.model_copy(update=values)))
+
+
 def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
     (first,) = plan_seeds(repeat_sequence(moment, tmp_path / "old" / "long", frames=8), tmp_path / "out", seeds=1)
@@ -36,7 +42,7 @@ def test_interrupted_job_continues_after_its_sequence_was_moved(moment: Path, tm
     assert progress == [1, 2, 3, 4] and (first.folder / RunFile.CHECKPOINT).is_file()
     (tmp_path / "old").rename(tmp_path / "new")
     (moved,) = plan_seeds(tmp_path / "new" / "long", tmp_path / "out", seeds=1)
-    assert moved.folder == first.folder and moved.source != first.source
+    assert moved.folder == first.folder and moved.request.seq != first.request.seq
     progress = []
     assert run_job(moved, progress.append) is None
     assert progress == [5, 6, 7, 8]
@@ -48,7 +54,7 @@ def test_interrupted_job_continues_with_another_number_of_threads(moment: Path, 
     """It changes no result."""
     (job,) = plan_seeds(moment, tmp_path / "out", seeds=1)
     _, report = stop_after(4)
-    assert run_job(replace(job, config=job.config.model_copy(update={"threads": 3})), report) is not None
+    assert run_job(with_values(job, threads=3), report) is not None
     progress: list[int] = []
     assert run_job(job, progress.append) is None
     assert progress == [5, 6]
@@ -60,7 +66,7 @@ def test_interrupted_job_starts_again_if_its_configuration_has_changed(moment: P
     assert run_job(job, report) is not None
     features = job.config.features.model_copy(update={"count": 700})
     progress: list[int] = []
-    assert run_job(replace(job, config=job.config.model_copy(update={"features": features})), progress.append) is None
+    assert run_job(with_values(job, features=features), progress.append) is None
     assert progress == [1, 2, 3, 4, 5, 6]
 
 

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from helpers.batches import plan_seeds
+from helpers.batches import plan_seeds, without_camera_and_stamps
 from helpers.commands import assert_error_line, call_here, invoke
 
 from v3d_torch.batch import ablation_study
@@ -97,6 +97,15 @@ def test_every_run_writes_results_and_configuration_of_its_variant(done: tuple[P
 
 def test_sequence_of_a_run_is_found_again(done: tuple[Path, str], sequence: Path) -> None:
     assert read_request(done[0] / "moment" / "baseline" / "seed0").seq == str(sequence)
+
+
+def test_camera_and_frame_rate_of_a_sequence_without_them(sequence: Path, tmp_path: Path) -> None:
+    numbered, camera = without_camera_and_stamps(sequence, tmp_path)
+    arguments = ("--seq", numbered, "--variants", "baseline", "--seeds", "1", "--out", tmp_path / "out")
+    result = call(*arguments, "--camera", camera, "--fps", "25")
+    assert result.exit_code == 0, result.output
+    request = read_request(tmp_path / "out" / "numbered" / "baseline" / "seed0")
+    assert (request.camera, request.fps) == (str(camera), 25)
 
 
 def test_folder_to_which_another_study_writes_is_error(sequence: Path, tmp_path: Path) -> None:

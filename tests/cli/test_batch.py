@@ -20,7 +20,7 @@ import pandas as pd
 import psutil
 import pytest
 import yaml
-from helpers.batches import ENDLESS, plan_seeds, repeat_sequence
+from helpers.batches import ENDLESS, plan_seeds, repeat_sequence, without_camera_and_stamps
 from helpers.commands import RUN_FILES, assert_error_line, files_in, invoke
 from helpers.privileges import without_root_rights
 from helpers.waiting import wait_until
@@ -259,6 +259,23 @@ def test_finished_runs_are_not_overwritten(repaired: tuple[Path, Result, dict[Pa
     result = call(*arguments_in(folder), "--resume")
     assert_error_line(result, folder / "out" / "good" / "few", "other values")
     assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def test_camera_and_frame_rate_of_sequences_without_them(moment: Path, tmp_path: Path) -> None:
+    sequence, camera = without_camera_and_stamps(moment, tmp_path)
+    arguments = ("--seqs", sequence, "--configs", "baseline", "--fps", "25", "--out", tmp_path / "out")
+    assert_error_line(call(*arguments), "--camera")
+    result = call(*arguments, "--camera", camera)
+    assert result.exit_code == 0 and "no ground truth" in result.output, result.output
+    folder = tmp_path / "out" / "numbered" / "baseline" / "seed0"
+    stamps = [float(line.split()[0]) for line in (folder / "trajectory.txt").read_text().splitlines()]
+    assert stamps == pytest.approx([index / 25 for index in range(len(stamps))], abs=1e-6)
+    request = yaml.safe_load((folder / "request.yaml").read_text())
+    assert (request["camera"], request["fps"]) == (str(camera), 25)
+    assert ", seed" not in call(*arguments, "--camera", camera, "--resume").stdout
+    (tmp_path / "other.yaml").write_text(camera.read_text().replace("fx: ", "fx: 1"))
+    changed = call(*arguments, "--camera", tmp_path / "other.yaml", "--resume")
+    assert_error_line(changed, "contains a finished run with another camera")
 
 
 @pytest.fixture

@@ -36,7 +36,7 @@ from v3d_torch.pipeline import ViewerGroup
 from v3d_torch.runs import results
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics
-from v3d_torch.runs.request import read_request
+from v3d_torch.runs.request import RunRequest, read_request
 from v3d_torch.runs.result_folder import lock_results
 from v3d_torch.runs.stored_run import read_run
 
@@ -659,7 +659,7 @@ def test_interrupted_run_of_a_batch_resumes(sequence: Path, tmp_path: Path) -> N
     config = load_config(overrides=["segmentation.source=none", "prefetch=false"])
 
     def job(name: str) -> Job:
-        return Job("seq", str(sequence), FRAMES, "", None, "own", config, tmp_path / name)
+        return Job("seq", FRAMES, "", "own", RunRequest(str(sequence), config), tmp_path / name)
 
     def stop(count: int) -> None:
         if count == 6:

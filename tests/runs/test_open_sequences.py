@@ -14,17 +14,24 @@ import pytest
 from helpers.corpus.base import write_base
 from rich.console import Console
 
+from v3d_torch.config import Config
+from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.demo.sequence import CAMERA
 from v3d_torch.errors import InputError
-from v3d_torch.runs.open_sequences import open_sequence, open_sequences, print_notes
+from v3d_torch.runs.open_sequences import open_sequences, print_notes
+from v3d_torch.runs.request import RunRequest
+
+
+def requests(*sequences: object) -> list[RunRequest]:
+    return [RunRequest(str(sequence), Config()) for sequence in sequences]
 
 
 def test_damaged_ground_truth_is_rejected(tmp_path: Path) -> None:
     write_base(tmp_path / "seq")
-    assert list(open_sequences([str(tmp_path / "seq")], None, Console())) == ["seq"]
+    assert list(open_sequences(requests(tmp_path / "seq"), Console())) == ["seq"]
     (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
     with pytest.raises(InputError, match=r"groundtruth\.txt: line 1 is '1 2 3'"):
-        open_sequences([str(tmp_path / "seq")], None, Console())
+        open_sequences(requests(tmp_path / "seq"), Console())
 
 
 @pytest.mark.filterwarnings("ignore::v3d_torch.errors.GroundTruthWarning")
@@ -32,7 +39,7 @@ def test_damaged_ground_truth_is_noted_before_a_run(tmp_path: Path) -> None:
     write_base(tmp_path / "seq")
     output = StringIO()
     for _ in range(2):
-        open_sequence(str(tmp_path / "seq"), None, Console(file=output, width=300))
+        print_notes(load_sequence(tmp_path / "seq"), Console(file=output, width=300))
         (tmp_path / "seq" / "groundtruth.txt").write_text("1 2 3\n")
     (note,) = output.getvalue().splitlines()
     assert note.startswith(f"note: seq: the ground truth cannot be read: {tmp_path / 'seq' / 'groundtruth.txt'}: ")
@@ -65,7 +72,7 @@ def test_two_sequences_with_the_same_name_are_rejected(tmp_path: Path) -> None:
     for folder in (first, second):
         write_base(folder)
     with pytest.raises(InputError, match=re.escape(f"{second}: {first} has the same name, seq; run them separately")):
-        open_sequences([str(first), str(second)], None, Console())
+        open_sequences(requests(first, second), Console())
 
 
 def test_two_sequences_with_the_same_folder_of_results_are_rejected(tmp_path: Path) -> None:
@@ -76,9 +83,9 @@ def test_two_sequences_with_the_same_folder_of_results_are_rejected(tmp_path: Pa
     for kind, name in (("rgb", "color"), ("depth", "depth")):
         for index, image in enumerate(sorted((other / kind).iterdir())):
             shutil.copyfile(image, scenes / f"frame-{index:06d}.{name}.png")
-    assert [*open_sequences([str(scenes)], None, Console())] == ["chess/seq-01"]
+    assert [*open_sequences(requests(scenes), Console())] == ["chess/seq-01"]
     with pytest.raises(InputError, match=re.escape(f"{other}: {scenes} has the same name, chess_seq-01; run them")):
-        open_sequences([str(scenes), str(other)], None, Console())
+        open_sequences(requests(scenes, other), Console())
 
 
 def test_all_sequences_that_are_not_valid_are_named(tmp_path: Path) -> None:
@@ -89,7 +96,7 @@ def test_all_sequences_that_are_not_valid_are_named(tmp_path: Path) -> None:
     (names[3] / "groundtruth.txt").write_text("1 2 3\n")
     output = StringIO()
     with pytest.raises(InputError, match=f"^3 of 4 sequences are not valid, the first: {re.escape(str(names[1]))}: "):
-        open_sequences([*map(str, names), str(names[1])], None, Console(file=output, width=300))
+        open_sequences(requests(*names, names[1]), Console(file=output, width=300))
     heading, *lines = output.getvalue().splitlines()
     assert heading == "These sequences are not valid:" and len(lines) == 3
     for name, line in zip(names[1:], lines, strict=True):

@@ -33,7 +33,7 @@ from v3d_torch.io.names import folder_name
 from v3d_torch.io.text import describe_error
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.file_names import RunFile
-from v3d_torch.runs.open_sequences import open_sequences
+from v3d_torch.runs.open_sequences import OpenedSequence, open_sequences
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import lock_results, make_result_folder
@@ -82,6 +82,8 @@ def run_ablation_study(
     seeds: int,
     overrides: Sequence[str],
     data_root: Path | None,
+    camera: str | None,
+    fps: float | None,
     out: Path | None,
 ) -> None:
     """Run the study, show and write its tables; arguments as in ``v3d-torch ablate --help``.
@@ -98,19 +100,19 @@ def run_ablation_study(
         for variant, config in variant_configs.items()
         for seed in range(seeds)
     }
-    sources = list(dict.fromkeys(names))
-    opened = open_sequences(sources, data_root, console)
-    sequences = {name: (source, opened[name]) for source, name in zip(sources, opened, strict=True)}
+    root = None if data_root is None else str(data_root)
+    requests = [RunRequest(name, Config(), data_root=root, camera=camera, fps=fps) for name in names]
+    sequences = open_sequences(requests, console)
     network = cache(make_instance_source)
-    camera = next(iter(opened.values())).camera
+    first_camera = next(iter(sequences.values())).sequence.camera
     for config in configs.values():  # a missing segmenter is an error before the first run
         if config.stages.segment is None:
             network(_network_config(config))
         else:
-            make_segmenter(config, camera)
+            make_segmenter(config, first_camera)
     folder = make_result_folder(out, "ablation")
     with lock_results(folder):
-        outcomes = _run_variants(folder, sequences, configs, network, data_root, console)
+        outcomes = _run_variants(folder, sequences, configs, network, console)
     console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
     print_line(console, f"results: {folder}")
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
@@ -119,20 +121,18 @@ def run_ablation_study(
 
 def _run_variants(
     folder: Path,
-    sequences: Mapping[str, tuple[str, RGBDSequence]],
+    sequences: Mapping[str, OpenedSequence],
     configs: Mapping[tuple[str, int], Config],
     network: Callable[[SegmentationConfig], Segmenter],
-    data_root: Path | None,
     console: Console,
 ) -> list[Outcome]:
     """Run each configuration, given by variant and seed, on each sequence; write the tables after each run.
 
     Args:
         folder: Folder of the study.
-        sequences: Source (path or name) and opened sequence, by the name in tables.
+        sequences: Sequences by the name in tables, each with the request of its runs.
         configs: Configurations by variant and seed.
         network: Function that returns the network of a configuration.
-        data_root: Folder of named sequences, with which another command finds them again; None for ``$V3D_DATA``.
         console: Console for progress and tables.
     """
     for table, contents in ((STUDY_TABLE, "an earlier study"), (RUNS_TABLE, "a batch")):
@@ -140,17 +140,17 @@ def _run_variants(
             raise InputError(f"{folder}: contains {contents}; choose another folder with --out")
     outcomes: list[Outcome] = []
     try:
-        for name, (source, sequence) in sequences.items():
+        for name, opened in sequences.items():
             cached: dict[SegmentationConfig, Segmenter] = {}
             for (variant, seed), config in configs.items():
                 if config.stages.segment is None:
                     key = _network_config(config)
                     segment = wrap_upright(cached.setdefault(key, CachedSegmenter(network(key))), config.segmentation)
                 else:
-                    segment = make_segmenter(config, sequence.camera)
+                    segment = make_segmenter(config, opened.sequence.camera)
                 run_folder = make_result_folder(folder / folder_name(name) / variant / f"seed{seed}", name)
-                request = RunRequest(source, config, data_root=None if data_root is None else str(data_root))
-                metrics, failure = _run(request, sequence, segment, run_folder, console)
+                request = replace(opened.request, config=config)
+                metrics, failure = _run(request, opened.sequence, segment, run_folder, console)
                 outcomes.append(Outcome(name, variant, seed, metrics, failure))
                 print_line(console, str(outcomes[-1]))
                 write_text(folder / "ablation.md", format_markdown(outcomes, _NOTE))

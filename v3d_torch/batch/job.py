@@ -13,6 +13,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation.outcome import Outcome
 from v3d_torch.runs.file_names import RunFile
+from v3d_torch.runs.request import RunRequest
 
 
 @dataclass(frozen=True)
@@ -21,25 +22,24 @@ class Job:
 
     Attributes:
         sequence: Name of the sequence in tables.
-        source: Path or name of the sequence, see `load_sequence`.
         frames: Number of frames of the sequence.
         digest: Digest of the sequence, see `sequence_digest`.
-        data_root: Folder of named sequences.
         config_name: Name of the configuration in tables.
-        config: Configuration of the run, including its seed.
+        request: Request of the run, independent of the machine's environment; its configuration includes the seed.
         folder: Folder of the results.
-        skip_broken: True to skip broken frames.
     """
 
     sequence: str
-    source: str
     frames: int
     digest: str
-    data_root: Path | None
     config_name: str
-    config: Config
+    request: RunRequest
     folder: Path
-    skip_broken: bool = False
+
+    @property
+    def config(self) -> Config:
+        """Configuration of the run, including its seed."""
+        return self.request.config
 
     def __str__(self) -> str:
         """Return a one-line description for the screen."""
@@ -81,7 +81,7 @@ class Job:
         if metrics.get("sequence_digest", self.digest) != self.digest:  # earlier versions stored no digest
             raise InputError(
                 f"{self.folder}: contains a finished run with another camera, other timestamps or another ground truth"
-                f" than {self.source} has; choose another folder with --out, or delete this one to run it again"
+                f" than {self.request.seq} has; choose another folder with --out, or delete this one to run it again"
             )
         return self.make_outcome(None)
 

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from v3d_torch.batch.job import Job, single_threaded
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
-from v3d_torch.datasets import RGBDSequence
-from v3d_torch.datasets.locate import data_root_of
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import ConfigError
 from v3d_torch.io.names import folder_name
-from v3d_torch.io.paths import expand_user
+from v3d_torch.runs.open_sequences import OpenedSequence
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import import_stage
 from v3d_torch.segmentation import make_instance_source
@@ -79,38 +78,28 @@ def prepare_stages(configs: Mapping[str, Config]) -> None:
 
 
 def plan_jobs(
-    sequences: Mapping[str, tuple[str, RGBDSequence]],
-    configs: Mapping[str, Config],
-    *,
-    seeds: int,
-    data_root: Path | None,
-    folder: Path,
-    skip_broken: bool = False,
+    sequences: Mapping[str, OpenedSequence], configs: Mapping[str, Config], *, seeds: int, folder: Path
 ) -> list[Job]:
     """Return the jobs of a batch, ordered by sequence, configuration and seed.
 
     Args:
-        sequences: Source (path or name) and opened sequence, by the name in tables.
+        sequences: Sequences by the name in tables, each with the request of its runs.
         configs: Configurations by the name in tables.
         seeds: Number of runs for each sequence and configuration; their seeds count from 0.
-        data_root: Folder of named sequences; None for ``$V3D_DATA``, which is stored in the jobs of sequences in it.
         folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
-        skip_broken: True if runs skip broken frames.
     """
-    digests = {name: sequence_digest(sequence) for name, (_, sequence) in sequences.items()}
+    digests = {name: sequence_digest(opened.sequence) for name, opened in sequences.items()}
     return [
         Job(
             sequence=name,
-            source=str(path.absolute()) if (path := expand_user(source)).exists() else source,
-            frames=len(sequence),
+            frames=len(opened.sequence),
             digest=digests[name],
-            data_root=data_root_of(source, data_root),  # other machines may lack the variable
             config_name=label,
-            config=config.model_copy(update={"seed": seed}),
+            # Absolute, because another machine may have another working directory and environment.
+            request=replace(opened.request, config=config.model_copy(update={"seed": seed})).absolute(),
             folder=folder.absolute() / folder_name(name) / label / f"seed{seed}",
-            skip_broken=skip_broken,
         )
-        for name, (source, sequence) in sequences.items()
+        for name, opened in sequences.items()
         for label, config in configs.items()
         for seed in range(seeds)
     ]

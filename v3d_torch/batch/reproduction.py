@@ -14,8 +14,9 @@ from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.runner import check_resume, run_missing_jobs
 from v3d_torch.batch.wide_console import wide_console
+from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL
-from v3d_torch.datasets import PAPER_SEQUENCES, RGBDSequence, short_name
+from v3d_torch.datasets import PAPER_SEQUENCES, short_name
 from v3d_torch.datasets.locate import data_folder, find_stored
 from v3d_torch.datasets.sequence_names import download_url
 from v3d_torch.errors import DownloadError, InputError
@@ -29,8 +30,9 @@ from v3d_torch.evaluation.tables import (
     make_screen_table,
 )
 from v3d_torch.io.files import write_text
-from v3d_torch.runs.open_sequences import check_groundtruth, open_sequence
+from v3d_torch.runs.open_sequences import OpenedSequence, open_sequence
 from v3d_torch.runs.print_line import print_line
+from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import lock_results, make_result_folder
 
 TABLE_CONFIGS = (FULL, "paper", "baseline")
@@ -68,8 +70,7 @@ def run_reproduction(
         print_line(console, advice)
     prepare_stages(configs)
     folder = make_result_folder(out, "reproduce")
-    sequences = {name: (name, sequence) for name, sequence in opened.items()}
-    jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder)
+    jobs = plan_jobs(opened, configs, seeds=seeds, folder=folder)
     absent = list(map(short_name, missing))
     with lock_results(folder):
         record = ReproductionRecord(jobs, folder.absolute(), list(table_configs), absent, study=study)
@@ -147,7 +148,7 @@ def describe_missing(missing: Sequence[str], folder: Path, reason: str | None) -
 
 def _open_paper_sequences(
     data_root: Path | None, download: bool, console: Console
-) -> tuple[dict[str, RGBDSequence], list[str], str | None]:
+) -> tuple[dict[str, OpenedSequence], list[str], str | None]:
     """Open the paper's sequences that are available.
 
     Returns:
@@ -157,7 +158,7 @@ def _open_paper_sequences(
     Raises:
         InputError: If a sequence or its ground truth is damaged.
     """
-    opened: dict[str, RGBDSequence] = {}
+    opened: dict[str, OpenedSequence] = {}
     missing: list[str] = []
     reason: str | None = None
     for full_name in PAPER_SEQUENCES:
@@ -165,12 +166,12 @@ def _open_paper_sequences(
         if not download and find_stored(name, data_root) is None:
             missing.append(full_name)
             continue
+        request = RunRequest(name, Config(), data_root=None if data_root is None else str(data_root))
         try:
-            sequence = open_sequence(name, data_root, console)
+            sequence = open_sequence(request, console)
         except DownloadError as error:
             missing.append(full_name)
             reason = reason or str(error.__cause__ or error)
         else:
-            check_groundtruth(sequence)  # the tables contain scores
-            opened[name] = sequence
+            opened[name] = OpenedSequence(request, sequence)
     return opened, missing, reason

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from v3d_torch.batch.job import Job, single_threaded
-from v3d_torch.datasets import load_sequence
 from v3d_torch.errors import DepthScaleWarning, GroundTruthWarning, InputError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.text import describe_error
@@ -15,7 +14,7 @@ from v3d_torch.pipeline import FrameCallback
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, read_checkpoint
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.log import log_to
-from v3d_torch.runs.request import CHANGEABLE, RunRequest
+from v3d_torch.runs.request import CHANGEABLE
 from v3d_torch.runs.result_folder import clear_earlier_results, lock_results
 from v3d_torch.runs.run import Run
 from v3d_torch.segmentation import make_segmenter
@@ -53,19 +52,14 @@ def _run(job: Job, on_frame: FrameCallback) -> str | None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", GroundTruthWarning)  # in the diagnosis of the run
             warnings.simplefilter("ignore", DepthScaleWarning)  # in the log of the run
-            sequence = load_sequence(job.source, data_root=job.data_root, skip_broken=job.skip_broken)
+            sequence = job.request.load_sequence()
         if checkpoint is not None and describe_change(checkpoint, sequence) is not None:
             clear_earlier_results(job.folder)
             checkpoint = None
         segment = make_segmenter(job.config, sequence.camera)
-        run = Run(_make_request(job), sequence, segment, job.folder, checkpoint=checkpoint)
+        run = Run(job.request, sequence, segment, job.folder, checkpoint=checkpoint)
         run(on_frame)
     return run.pipeline.record.failure
-
-
-def _make_request(job: Job) -> RunRequest:
-    data_root = None if job.data_root is None else str(job.data_root)
-    return RunRequest(job.source, job.config, data_root=data_root, skip_broken=job.skip_broken)
 
 
 def _matching_checkpoint(job: Job) -> Checkpoint | None:
@@ -74,7 +68,7 @@ def _matching_checkpoint(job: Job) -> Checkpoint | None:
         checkpoint = read_checkpoint(job.folder)
     except InputError:
         return None
-    request, wanted = checkpoint.request, _make_request(job).absolute()
+    request, wanted = checkpoint.request, job.request
     changed = {name: getattr(wanted, name) for name in CHANGEABLE}
     same = replace(request, config=single_threaded(request.config), **changed) == replace(
         wanted, config=single_threaded(wanted.config)

@@ -16,6 +16,7 @@ from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.batch.wide_console import wide_console
+from v3d_torch.config import Config
 from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.runs.interrupts import interrupts_between_frames
@@ -23,6 +24,7 @@ from v3d_torch.runs.kernel_compilation import compile_kernels
 from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import progress_bars
+from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_folder import check_unlocked, lock_results, make_result_folder
 
 
@@ -35,6 +37,8 @@ def run_batch(
     out: Path | None,
     resume: bool,
     data_root: Path | None,
+    camera: str | None,
+    fps: float | None,
     ray: str | None,
     skip_broken: bool,
 ) -> None:
@@ -52,11 +56,15 @@ def run_batch(
     for note in matches.notes:
         print_line(console, f"note: {note}")
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
-    opened = open_sequences(matches.sequences, data_root, console, skip_broken=skip_broken)
-    sequences = {name: (source, opened[name]) for source, name in zip(matches.sequences, opened, strict=True)}
+    root = None if data_root is None else str(data_root)
+    requests = [
+        RunRequest(seq, Config(), data_root=root, camera=camera, fps=fps, skip_broken=skip_broken)
+        for seq in matches.sequences
+    ]
+    sequences = open_sequences(requests, console)
     prepare_stages(configs)
     folder = make_result_folder(out, "batch")
-    jobs = plan_jobs(sequences, configs, seeds=seeds, data_root=data_root, folder=folder, skip_broken=skip_broken)
+    jobs = plan_jobs(sequences, configs, seeds=seeds, folder=folder)
     with lock_results(folder):
         advice = "" if skip_broken else ", with --skip-broken if broken frames ended them"
         run_missing_jobs(BatchRecord(jobs, folder.absolute()), executor, console, resume=resume, advice=advice)

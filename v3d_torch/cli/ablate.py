@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import DataRoot, make_app
+from v3d_torch.cli.options import Camera, DataRoot, Fps, make_app
 from v3d_torch.io.paths import expand_user_paths
 from v3d_torch.runtime.imports import quick_imports
 
@@ -26,6 +26,8 @@ def main(
         ),
     ],
     data_root: DataRoot = None,
+    camera: Camera = None,
+    fps: Fps = None,
     variants: Annotated[str, typer.Option(help="Variants to run, separated by commas.")] = (
         "baseline,no_voting,no_free_space,no_chamfer,no_prediction,no_appearance,no_unlabelled,not_upright,"
         "global_shutter,paper,full"
@@ -46,4 +48,6 @@ def main(
 
     with exit_on_error():
         names = [name.strip() for name in variants.split(",")]
-        run_ablation_study(seq, names, seeds=seeds, overrides=set_ or [], data_root=data_root, out=out)
+        run_ablation_study(
+            seq, names, seeds=seeds, overrides=set_ or [], data_root=data_root, camera=camera, fps=fps, out=out
+        )

@@ -8,7 +8,17 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import DataRoot, MultiValueCommand, Resume, Seeds, SkipBroken, make_app, workers_option
+from v3d_torch.cli.options import (
+    Camera,
+    DataRoot,
+    Fps,
+    MultiValueCommand,
+    Resume,
+    Seeds,
+    SkipBroken,
+    make_app,
+    workers_option,
+)
 from v3d_torch.io.paths import expand_user_paths
 from v3d_torch.runtime.imports import quick_imports
 
@@ -43,6 +53,8 @@ def main(
     resume: Resume = False,
     skip_broken: SkipBroken = False,
     data_root: DataRoot = None,
+    camera: Camera = None,
+    fps: Fps = None,
     ray: Annotated[
         str | None,
         typer.Option(
@@ -67,6 +79,8 @@ def main(
             out=out,
             resume=resume,
             data_root=data_root,
+            camera=camera,
+            fps=fps,
             ray=ray,
             skip_broken=skip_broken,
         )

@@ -16,7 +16,7 @@ from rich.table import Table
 from v3d_torch.batch.batch_folder import describe_contents
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
-from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
+from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
 from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError
@@ -290,14 +290,7 @@ def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
     if request.realtime and request.skip_broken:
         raise ConfigError("--realtime: a broken frame ends the playback; remove --skip-broken")
     with progress_bars(console) as progress:
-        source = open_source(
-            request.seq,
-            data_root=_path(request.data_root),
-            camera=request.camera,
-            options=request.source_options,
-            progress=ProgressBar(progress, "sequence"),
-            skip_broken=request.skip_broken,
-        )
+        source = request.open_source(ProgressBar(progress, "sequence"))
     return RealtimePlayback(source) if request.realtime else source
 
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
 
 from rich.console import Console
 
-from v3d_torch.datasets import RGBDSequence, RGBDStream, load_sequence
+from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.datasets.realtime_playback import stored_source
 from v3d_torch.datasets.stored import StoredSequence
 from v3d_torch.errors import InputError
 from v3d_torch.io.names import folder_name
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
+from v3d_torch.runs.request import RunRequest
 
 _MANY_PIXELS = 1 << 22
 """Number of pixels of an image above which the memory of a run is stated: that of smaller images is below 3 GB."""
@@ -22,17 +23,31 @@ _BYTES_PER_PIXEL = 500
 """Memory of a run for each pixel of an image, measured on sequences of 640x360 to 1920x1080 pixels."""
 
 
-def open_sequence(name: str, data_root: Path | None, console: Console) -> RGBDSequence:
-    """Open a sequence as `load_sequence` does, with a progress bar for downloads, and print notes on it."""
-    sequence = _load(name, data_root, console)
+@dataclass(frozen=True)
+class OpenedSequence:
+    """Sequence that was opened for one or several runs.
+
+    Attributes:
+        request: Request of a run of the sequence.
+        sequence: The sequence.
+    """
+
+    request: RunRequest
+    sequence: RGBDSequence
+
+
+def open_sequence(request: RunRequest, console: Console) -> RGBDSequence:
+    """Open the sequence of a run, with a progress bar for downloads, and print notes on it.
+
+    Raises:
+        InputError: If the sequence is not valid, or its ground truth could not be read: runs are compared by scores.
+        DownloadError: If the sequence is missing and cannot be downloaded.
+    """
+    with progress_bars(console) as progress:
+        sequence = request.load_sequence(ProgressBar(progress, "sequence"))
+    check_groundtruth(sequence)
     print_notes(sequence, console)
     return sequence
-
-
-def _load(name: str, data_root: Path | None, console: Console, *, skip_broken: bool = False) -> RGBDSequence:
-    with progress_bars(console) as progress:
-        bar = ProgressBar(progress, "sequence")
-        return load_sequence(name, data_root=data_root, progress=bar, skip_broken=skip_broken)
 
 
 def print_notes(source: RGBDStream, console: Console) -> None:
@@ -60,12 +75,14 @@ def check_groundtruth(source: RGBDStream) -> None:
         raise source.groundtruth_error
 
 
-def open_sequences(
-    names: Sequence[str], data_root: Path | None, console: Console, *, skip_broken: bool = False
-) -> dict[str, RGBDSequence]:
-    """Open several sequences in the given order, before the first of them is run; see `load_sequence`.
+def open_sequences(requests: Sequence[RunRequest], console: Console) -> dict[str, OpenedSequence]:
+    """Open several sequences in the given order, before the first of them is run.
 
     All sequences are opened before an InputError is raised. If several are not valid, a line is printed for each.
+
+    Args:
+        requests: Requests of runs. Duplicates are opened once.
+        console: Console for progress bars, notes and errors.
 
     Returns:
         Sequences by their name in tables.
@@ -74,19 +91,17 @@ def open_sequences(
         InputError: If sequences are not valid, or two sequences have the same name, also as folders of results.
         DownloadError: If a sequence is missing and cannot be downloaded.
     """
-    sequences: dict[str, RGBDSequence] = {}
+    opened: dict[str, OpenedSequence] = {}
     sources: dict[str, str] = {}
     errors: list[InputError] = []
-    names = list(dict.fromkeys(names))
-    for name in names:
+    requests = list(dict.fromkeys(requests))
+    for request in requests:
         try:
-            sequence = _load(name, data_root, console, skip_broken=skip_broken)
-            check_groundtruth(sequence)  # runs are compared by their scores
-            print_notes(sequence, console)
+            sequence = open_sequence(request, console)
             folder = folder_name(sequence.name)  # of the results, such as a_b for the sequence a/b
-            if (other := sources.setdefault(folder, name)) != name:
-                raise InputError(f"{name}: {other} has the same name, {folder}; run them separately")
-            sequences[sequence.name] = sequence
+            if (other := sources.setdefault(folder, request.seq)) != request.seq:
+                raise InputError(f"{request.seq}: {other} has the same name, {folder}; run them separately")
+            opened[sequence.name] = OpenedSequence(request, sequence)
         except InputError as error:
             errors.append(error)
     if len(errors) == 1:
@@ -95,5 +110,5 @@ def open_sequences(
         console.print("These sequences are not valid:")
         for invalid in errors:
             print_line(console, str(invalid))
-        raise InputError(f"{len(errors)} of {len(names)} sequences are not valid, the first: {errors[0]}")
-    return sequences
+        raise InputError(f"{len(errors)} of {len(requests)} sequences are not valid, the first: {errors[0]}")
+    return opened

@@ -14,11 +14,12 @@ from pydantic import TypeAdapter, ValidationError
 
 from v3d_torch.config import Config
 from v3d_torch.config.validation import first_error
-from v3d_torch.datasets import SourceOptions
+from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_sequence, open_source
 from v3d_torch.datasets.cameras import PRESETS
 from v3d_torch.datasets.locate import data_root_of
 from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
 from v3d_torch.errors import InputError
+from v3d_torch.io.download import Progress
 from v3d_torch.io.files import write_text
 from v3d_torch.io.paths import expand_user
 from v3d_torch.io.safe_yaml import parse_yaml
@@ -69,10 +70,22 @@ class RunRequest:
     realtime: bool = False
     skip_broken: bool = False
 
-    @property
-    def source_options(self) -> SourceOptions:
-        """Options of the source of frames."""
-        return SourceOptions(self.rgb_topic, self.depth_topic, self.info_topic, self.fps)
+    def open_source(self, progress: Progress | None = None) -> RGBDStream:
+        """Open the source of frames, see `v3d_torch.datasets.open_source`."""
+        return open_source(self.seq, progress=progress, **self._source_options())
+
+    def load_sequence(self, progress: Progress | None = None) -> RGBDSequence:
+        """Open the source of frames, which must be a stored sequence, see `v3d_torch.datasets.load_sequence`."""
+        return load_sequence(self.seq, progress=progress, **self._source_options())
+
+    def _source_options(self) -> dict[str, Any]:
+        """Return the arguments of `open_source` and `load_sequence` but the name."""
+        return {
+            "data_root": self.data_root,
+            "camera": self.camera,
+            "options": SourceOptions(self.rgb_topic, self.depth_topic, self.info_topic, self.fps),
+            "skip_broken": self.skip_broken,
+        }
 
     def absolute(self) -> RunRequest:
         """Return the same request with absolute paths, independent of the working directory and of ``$V3D_DATA``."""

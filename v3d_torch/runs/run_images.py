@@ -11,7 +11,7 @@ import cv2
 import torch
 from torch import Tensor
 
-from v3d_torch.datasets import RGBDSequence, RGBDStream, open_source
+from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.datasets.open_source import is_live
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import InputError
@@ -45,14 +45,7 @@ def open_images(run: StoredRun, request: RunRequest, progress: Progress | None) 
             " run the recording"
         )
     check_not_moved(request, run.folder)
-    return open_source(
-        request.seq,
-        data_root=request.data_root,
-        camera=request.camera,
-        options=request.source_options,
-        progress=progress,
-        skip_broken=request.skip_broken,
-    )
+    return request.open_source(progress)
 
 
 def note_other_name(run: StoredRun, source: RGBDStream) -> str | None:
