@@ -59,7 +59,7 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
         if truth is None:
             raise InputError(f"{sequence.name}: frame {frame.index} has no true mask; choose another sequence")
         white = ((truth > 0) & (truth < 255)).to(torch.uint8).mul(255).expand(3, -1, -1)
-        static, motion = objects.static_without_people, (frame.depth_delay, objects.T_dc)
+        static, motion = objects.map_mask, (frame.depth_delay, objects.T_dc)
         views.add(keyframe, frame.image, frame.depth, static, *motion)
         masked.add(keyframe, white, frame.depth, static, *motion)
         unmasked.add(keyframe, white, frame.depth, torch.ones_like(static), *motion)

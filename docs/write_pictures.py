@@ -14,7 +14,7 @@ PICTURES = {
     "clusters.jpg": ("voting_step_by_step", "cell-7"),
     "distances.jpg": ("voting_step_by_step", "cell-11"),
     "votes_alone.jpg": ("voting_step_by_step", "cell-13"),
-    "newly_occupied.jpg": ("voting_step_by_step", "cell-15"),
+    "appeared_pixels.jpg": ("voting_step_by_step", "cell-15"),
     "chamfer.jpg": ("voting_step_by_step", "cell-21"),
     "map.jpg": ("quickstart", "cell-11"),
 }

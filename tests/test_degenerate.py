@@ -183,9 +183,9 @@ def test_motion_that_points_on_a_line_do_not_determine_explains_them(motion: str
     T_ba = se3_exp(MOTIONS[motion])
     a, b = views(points("line"), T_ba)
     found = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
-    assert found is not None and len(found.pairs) == len(a)
-    moved = points("line")[found.pairs[:, 0]] @ found.T_ba[:3, :3].T + found.T_ba[:3, 3]
-    assert (CAMERA.project(moved) - b.uv[found.pairs[:, 1]]).norm(dim=1).max() < 3
+    assert found is not None and len(found.inlier_matches) == len(a)
+    moved = points("line")[found.inlier_matches[:, 0]] @ found.T_ba[:3, :3].T + found.T_ba[:3, 3]
+    assert (CAMERA.project(moved) - b.uv[found.inlier_matches[:, 1]]).norm(dim=1).max() < 3
 
 
 @pytest.mark.parametrize("motion", MOTIONS)

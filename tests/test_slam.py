@@ -99,7 +99,7 @@ def test_baseline_calls_object_stages_only_if_they_are_replaced_or_have_hooks(de
     for index in range(3):
         results = [slam(demo[index]) for slam in (plain, hooked, replaced)]
         assert torch.equal(results[0].T_wc, results[1].T_wc)
-        assert bool(results[0].static_mask.all()) and bool(results[0].static_without_people.all())
+        assert bool(results[0].static_mask.all()) and bool(results[0].map_mask.all())
         assert float(results[2].static_mask.float().mean()) == 0.5
     assert names == ["classify_motion"] * 3
     assert {"free_space", "clouds", "objects"}.isdisjoint(plain.timer.times) and "objects" in hooked.timer.times
@@ -339,7 +339,9 @@ def test_objects_seen_by_a_lost_camera_move_into_the_map_when_it_is_found() -> N
             motion = odometry(previous, current, *rest)
             if current.frame.index not in lost[:1]:
                 return motion
-            return replace(motion, T_cp=offset @ motion.T_cp, pairs=motion.pairs[:0], is_measured=False)
+            return replace(
+                motion, T_cp=offset @ motion.T_cp, inlier_matches=motion.inlier_matches[:0], is_measured=False
+            )
 
         class Track:
             reference_keyframe = staticmethod(track_camera.reference_keyframe)

@@ -23,6 +23,7 @@ from v3d_torch.mapping.landmark_ids import compact_landmarks
 from v3d_torch.mapping.mapper import Mapper
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.objects.appearance import colour_histograms
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.frame_objects import FrameObjects
@@ -30,7 +31,6 @@ from v3d_torch.objects.free_space_check import FreeSpaceCheck
 from v3d_torch.objects.image_scale import scale_to_image
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
 from v3d_torch.objects.motion_classifier import MotionClassifier
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.unlabelled import unlabelled_instances
 from v3d_torch.occupancy.floor import Floor
 from v3d_torch.occupancy.occupancy_mapper import OccupancyMapper
@@ -53,7 +53,7 @@ from v3d_torch.stages.protocols import (
     OdometryStage,
     ProposalStage,
 )
-from v3d_torch.stages.stage_checks import require_state
+from v3d_torch.stages.replaceable_stages import require_state
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.tracking.camera_tracker import CameraTracker
 from v3d_torch.tracking.map_tracker import MapTracker
@@ -208,15 +208,14 @@ class V3DSLAM(FramePreprocessor):
             frame: Next frame, later than the previous one.
 
         Returns:
-            Objects of the frame, and state of the camera as it is known now. Poses that later frames correct are in
-            ``poses``.
+            Result of `track`.
 
         Raises:
             InputError: If the frame is not valid, of another camera, or not later than the previous one.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
         self.check(frame)
-        check_next(frame, self.poses.stamp)  # before the segmenter sees the frame, because it can have state
+        check_next(frame, self.poses.stamp)  # before the frame is segmented, because the segmenter can have state
         preprocessed = self.preprocess(frame, self.predictions[0])
         self.advance_predictions()
         return self.track(preprocessed)
@@ -227,6 +226,10 @@ class V3DSLAM(FramePreprocessor):
 
         Args:
             preprocessed: Result of `preprocess` for the next frame.
+
+        Returns:
+            Objects of the frame, and state of the camera as it is known now. Poses that later frames correct are in
+            ``poses``.
 
         Raises:
             InputError: If the frame is not later than the previous one, or the depth of the first frame is not in
@@ -263,7 +266,7 @@ class V3DSLAM(FramePreprocessor):
             if view is not None and pose.status is not TrackingStatus.LOST:
                 T_dw = T_dc @ self.poses.T_cw
                 self.free_space_check.add_view(view, T_dw)
-                self.classify_motion.add_view(view, T_dw, objects.static_without_people)
+                self.classify_motion.add_view(view, T_dw, objects.map_mask)
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, twist of the camera
@@ -274,7 +277,7 @@ class V3DSLAM(FramePreprocessor):
             with self.timer("occupancy"):  # space that static surfaces occupy, and free space in front of them
                 self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate(), T_dc)
         # The world frame can have been corrected after the objects were tracked.
-        objects = self.classify_motion.apply_corrections(objects)
+        objects = self.classify_motion.correct_result(objects)
         return FrameResult(**vars(objects), **vars(state), T_dc=T_dc)
 
     def _track_objects(
@@ -294,16 +297,16 @@ class V3DSLAM(FramePreprocessor):
         """
         frame, depth = preprocessed.frame, preprocessed.extraction.depth
         if not self._has_objects:
-            self._wait_for_segmentation(preprocessed)
-            return FrameObjects.none(*depth.shape[-2:]), None
+            self._take_segmentation(preprocessed)
+            return FrameObjects.empty(*depth.shape[-2:]), None
         with self.timer("free_space"):  # not in the paper: surfaces that contradict a static scene
             was_lost = self.poses.status is TrackingStatus.LOST
             T_dw = T_dc @ self._compose_pose(motion)
             view = self.free_space_check.make_view(frame.stamp, depth, T_dw, is_motion_measured=motion.is_measured)
-            newly_occupied = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
-        segmentation = self._wait_for_segmentation(preprocessed)  # III-A
+            appeared_pixels = self.free_space_check(view, pose_known=motion.is_measured and not was_lost)
+        segmentation = self._take_segmentation(preprocessed)  # III-A
         with self.timer("free_space"):
-            instances = self._complete_instances(segmentation.instances, view, newly_occupied)
+            instances = self._complete_instances(segmentation.instances, view, appeared_pixels)
         with self.timer("clouds"):  # III-B.2: instance clouds without outliers
             clouds = self.back_project_instances(depth, instances)
             # The ids of propagated instances are known without a comparison.
@@ -312,7 +315,7 @@ class V3DSLAM(FramePreprocessor):
         with self.timer("objects"):  # III-C, III-D: ids, Hough voting, Chamfer distance, static mask
             residuals = motion.residuals(self._previous, features, self.camera)
             support = FeatureSupport(features.pixel, motion.inlier_mask(len(features)), residuals)
-            return self.classify_motion(instances, clouds, view, newly_occupied, support, appearance), view
+            return self.classify_motion(instances, clouds, view, appeared_pixels, support, appearance), view
 
     def flush(self) -> None:
         """Apply the pending result of the back end. `track` does this in every frame; call it after the last frame."""
@@ -401,8 +404,11 @@ class V3DSLAM(FramePreprocessor):
         """Compose the pose of the previous frame with the motion since then: world to camera, float64, (4, 4)."""
         return orthonormalise(motion.T_cp @ self.poses.T_cw)
 
-    def _wait_for_segmentation(self, preprocessed: PreprocessedFrame) -> Segmentation:
-        """Wait for the segmentation, and return it; until then, the network can run in parallel to other stages."""
+    def _take_segmentation(self, preprocessed: PreprocessedFrame) -> Segmentation:
+        """Wait for the segmentation, store the state of the segmenter and its up votes, and return it.
+
+        Until then, the network can run in parallel to other stages.
+        """
         segmentation = preprocessed.segmentation
         self._segmenter_state = segmentation.segmenter_state
         self.up_estimator.votes = up_votes(segmentation.segmenter_state)
@@ -410,14 +416,14 @@ class V3DSLAM(FramePreprocessor):
         return segmentation
 
     def _complete_instances(
-        self, instances: Instances | None, view: DepthView, newly_occupied: NewlyOccupied
+        self, instances: Instances | None, view: DepthView, appeared_pixels: AppearedPixels
     ) -> Instances:
         """Propagate the masks of objects to a frame without segmentation, and add moving regions without a class."""
         if instances is None:
             instances = self.classify_motion.propagate_instances(view)
         if not self._proposes_objects:
             return instances
-        return instances.concatenate(self.propose_unlabelled(newly_occupied, instances, view.depth))
+        return instances.concatenate(self.propose_unlabelled(appeared_pixels, instances, view.depth))
 
     def _extend_map(
         self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
@@ -427,19 +433,28 @@ class V3DSLAM(FramePreprocessor):
         predicted_T_cw = self._compose_pose(motion)  # includes corrections made after the objects were tracked
         keyframe = self.mapper(frame, features, pose, reference)
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
+        if keyframe is not None:
+            self.back_end.submit(keyframe)
         self._apply_world_correction(T_new_old)
-        is_other_part = self.poses.part != part
+        guessed_T_cw = predicted_T_cw if T_new_old is None else predicted_T_cw @ invert(T_new_old)
+        self._move_to_map(pose, guessed_T_cw, is_other_part=self.poses.part != part)
+        is_pose_known = self.poses.is_localised or not self.poses.was_found  # until then, the world frame is temporary
+        self.up_estimator.add_gravity(frame.gravity if is_pose_known else None, self.poses.T_cw, T_new_old)
+        return keyframe
+
+    def _move_to_map(self, pose: FramePose, guessed_T_cw: Tensor, *, is_other_part: bool) -> None:
+        """Move the objects of the frame from the pose with which they were tracked to the pose in the map.
+
+        Args:
+            pose: Pose of the frame.
+            guessed_T_cw: Pose with which its objects were tracked, float64, shape (4, 4).
+            is_other_part: True if the frame is in another part of the map than the frame before.
+        """
         if is_other_part:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
             self.classify_motion.drop_views()
         if pose.status is not TrackingStatus.LOST:
-            guessed_T_cw = predicted_T_cw if T_new_old is None else predicted_T_cw @ invert(T_new_old)
-            self.classify_motion.register(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_other_part)
-        is_pose_known = self.poses.is_localised or not self.poses.was_found  # until then, the world frame is temporary
-        self.up_estimator.add_gravity(frame.gravity if is_pose_known else None, self.poses.T_cw, T_new_old)
-        if keyframe is not None:
-            self.back_end.submit(keyframe)
-        return keyframe
+            self.classify_motion.move_to_map(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_other_part)
 
     def _predict(self) -> PosePrediction | None:
         """Predict the motion of the camera; None until the camera is found in a map of an earlier run."""

@@ -1,4 +1,4 @@
-"""Data that the stages exchange: frozen dataclasses of tensors.
+"""Data types that several packages use: frozen dataclasses of tensors.
 
 Conventions (see also docs/design.md): ``T_wc`` maps camera to world, ``p_w = T_wc @ p_c``; the camera looks along +z, x
 points right and y down; pixel centres lie at integers and (u, v) = (column, row); depth is in metres, 0 means "no
@@ -237,8 +237,28 @@ class TrackingStatus(StrEnum):
         return self in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
 
 
+class LandmarkObserver:
+    """Base class of data with the landmark id of each feature of an image.
+
+    Attributes:
+        landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
+    """
+
+    landmarks: Tensor
+
+    @property
+    def observed_landmarks(self) -> Tensor:
+        """Ids of the observed landmarks, int64, shape :math:`(L,)`."""
+        return self.landmarks[self.landmarks >= 0]
+
+    @property
+    def count(self) -> int:
+        """Number of observed landmarks."""
+        return len(self.observed_landmarks)
+
+
 @dataclass(frozen=True)
-class FramePose:
+class FramePose(LandmarkObserver):
     """Estimated pose of a frame.
 
     Attributes:
@@ -247,8 +267,8 @@ class FramePose:
         landmarks: Landmark id of each feature, -1 for none, int64, shape :math:`(N,)`.
         information: Information matrix of the left perturbation of ``T_cw``, under the assumption that the errors of
             the features are independent, float64, shape :math:`(6, 6)`; None if the pose was not tracked in the map.
-        is_relocalised: True if the camera was found in the map after a frame whose pose was not tracked in it. The
-            change of the pose since that frame then contains the error of its pose, and is no velocity.
+        is_relocalised: True if the pose does not continue that of the previous frame: the previous frame was not
+            tracked in the map, or place recognition found the camera. The change since then is no velocity.
     """
 
     status: TrackingStatus
@@ -256,16 +276,6 @@ class FramePose:
     landmarks: Tensor
     information: Tensor | None = None
     is_relocalised: bool = False
-
-    @property
-    def observed_landmarks(self) -> Tensor:
-        """Ids of the landmarks that the frame observes, int64, shape :math:`(F,)`."""
-        return self.landmarks[self.landmarks >= 0]
-
-    @property
-    def count(self) -> int:
-        """Number of landmarks that the frame observes."""
-        return len(self.observed_landmarks)
 
 
 @dataclass(frozen=True)

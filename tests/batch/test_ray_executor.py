@@ -75,7 +75,7 @@ def test_results_on_cluster_with_a_stage_of_the_configuration_are_identical_to_l
     config = single_threaded(load_config(tmp_path / "lab.yaml"))
     assert run_job(replace(job, request=replace(job.request, config=config)), lambda frames: None) is None
     remote = tmp_path / "cluster" / "moment" / "lab" / "seed0"
-    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "config.yaml"):
+    for name in ("trajectory.txt", "keyframes.txt", "objects.parquet", "map.ply", "config.yaml"):
         assert (remote / name).read_bytes() == (job.folder / name).read_bytes(), name
     assert json.loads((remote / "metrics.json").read_text())["stages"] == {"segment": f"{MODULE}:Corner"}
     del sys.modules[MODULE]  # other tests import it from other folders

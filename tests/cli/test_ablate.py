@@ -90,7 +90,7 @@ def test_one_table_contains_all_variants(done: tuple[Path, str]) -> None:
 def test_every_run_writes_results_and_configuration_of_its_variant(done: tuple[Path, str]) -> None:
     for variant in VARIANTS:
         folder = done[0] / "moment" / variant / "seed0"
-        for name in ("trajectory.txt", "metrics.json", "dynamics.parquet", "run.log", "figures/trajectory.png"):
+        for name in ("trajectory.txt", "metrics.json", "objects.parquet", "run.log", "figures/trajectory.png"):
             assert (folder / name).is_file()
         assert load_config(folder / "config.yaml") == load_config(CONFIGS[variant])
 
@@ -136,7 +136,7 @@ def test_results_are_identical_to_run_command(
     """The instances of ``no_prediction`` come from the cache that ``no_voting`` filled."""
     call_here("--seq", sequence, "--config", CONFIGS[variant], "--out", tmp_path, cwd=tmp_path)
     ours = done[0] / "moment" / variant / "seed0"
-    for name in ("trajectory.txt", "dynamics.parquet", "map.ply", "config.yaml"):
+    for name in ("trajectory.txt", "objects.parquet", "map.ply", "config.yaml"):
         assert (ours / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
 

@@ -233,7 +233,7 @@ def test_results_are_identical_with_one_and_two_workers(repaired: tuple[Path, Re
     """The restored sequence has the images of the good one, whose runs had two workers."""
     out = repaired[0] / "out"
     for config in ("baseline", "few"):
-        for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
+        for name in ("trajectory.txt", "keyframes.txt", "objects.parquet", "map.ply"):
             one, two = (out / sequence / config / "seed0" / name for sequence in ("broken", "good"))
             assert one.read_bytes() == two.read_bytes(), (config, name)
 

@@ -119,7 +119,7 @@ def test_configuration_file_gives_the_same_results(sequence: Path, own: Path, tm
     for name, option in (("a", ("--set", SEGMENT)), ("b", ("--config", tmp_path / "lab.yaml"))):
         done = call_here("--seq", sequence, "--out", tmp_path / name, *option, cwd=tmp_path)
         assert done.exit_code == 0, done.stderr
-    for name in ("trajectory.txt", "dynamics.parquet", "config.yaml"):
+    for name in ("trajectory.txt", "objects.parquet", "config.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
@@ -134,7 +134,7 @@ def test_run_is_resumed_only_if_the_user_names_its_stages_again(
     assert_error_line(call_here("--resume", interrupted, cwd=tmp_path), f"its run imported code, {SEGMENT}; give --set")
     assert call_here("--resume", interrupted, "--set", SEGMENT, cwd=tmp_path).exit_code == 0
     assert call_here("--seq", sequence, "--out", tmp_path / "whole", *OVERRIDES, cwd=tmp_path).exit_code == 0
-    for name in ("trajectory.txt", "dynamics.parquet", "map.ply"):
+    for name in ("trajectory.txt", "objects.parquet", "map.ply"):
         assert (interrupted / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 

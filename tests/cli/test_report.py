@@ -201,8 +201,8 @@ def test_page_reports_run_that_ended_early(tmp_path: Path) -> None:
     ("missing", "texts", "images"),
     [
         (
-            ["dynamics.parquet", "groundtruth.txt"],
-            ["not known: dynamics.parquet is missing", "There is no ground truth"],
+            ["objects.parquet", "groundtruth.txt"],
+            ["not known: objects.parquet is missing", "There is no ground truth"],
             4,
         ),
         (["frames.parquet", "config.yaml", "keyframes.txt"], ["There is no config.yaml", "0 keyframes"], 4),
@@ -357,7 +357,7 @@ def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
         ("metrics.json", lambda path: path.write_text("[]"), r"metrics\.json: the document: input should be"),
         ("trajectory.txt", lambda path: path.write_text("1 2 3\n"), r"trajectory\.txt: line 1"),
         ("trajectory.txt", lambda path: path.write_text("1 0 0 0 0 0 0 1\n"), "belong to different runs"),
-        ("dynamics.parquet", halve, r"dynamics\.parquet: is not a parquet table"),
+        ("objects.parquet", halve, r"objects\.parquet: is not a parquet table"),
         (
             "frames.parquet",
             lambda path: pq.write_table(pq.read_table(path).drop(["stamp"]), path),
@@ -384,7 +384,7 @@ def test_configuration_of_other_version_is_shown_but_not_compared(copy: Path) ->
 
 def test_objects_with_other_timestamps_than_frames_are_drawn(copy: Path) -> None:
     """Tables of two runs in one folder: objects are drawn at their own timestamps."""
-    table = pq.read_table(copy / "dynamics.parquet")
+    table = pq.read_table(copy / "objects.parquet")
     stamps: Tensor = torch.tensor(table.column("stamp").to_pylist(), dtype=torch.float64) + 0.05
     late = table.set_column(1, "stamp", [stamps.tolist()])
-    assert "person 1" in Page(render_page(replace(read_run(copy), dynamics=late))).text
+    assert "person 1" in Page(render_page(replace(read_run(copy), objects=late))).text

@@ -161,7 +161,7 @@ def test_run_prints_scores_and_result_folder(
 ) -> None:
     out, done = first_run
     assert done.stderr == ""
-    objects = pd.read_parquet(out / "dynamics.parquet")
+    objects = pd.read_parquet(out / "objects.parquet")
     summary = done.stdout.partition("time per frame")[0].splitlines()
     shown = {row[1].strip(): row[2].strip() for line in summary if len(row := line.split("│")) > 3}
     assert shown["objects"] == str(objects["id"].nunique())
@@ -212,7 +212,7 @@ def test_results_are_the_same_bytes_with_two_threads(first_out: Path, sequence: 
     """The first run had one thread. This run has two, in another process."""
     done = call_forked(*with_masks(sequence), "--out", tmp_path, "--set", "threads=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
+    for name in ("trajectory.txt", "keyframes.txt", "objects.parquet", "map.ply"):
         assert (tmp_path / name).read_bytes() == (first_out / name).read_bytes(), name
 
 
@@ -227,7 +227,7 @@ def test_run_without_segmenter_and_out_writes_a_folder_by_time(moment: Path, tmp
         assert latest.is_symlink()
         assert files_in(latest.resolve()) == RUN_FILES
         assert json.loads((latest / "metrics.json").read_text())["seed"] == seed
-        assert len(pd.read_parquet(latest / "dynamics.parquet")) == 0
+        assert len(pd.read_parquet(latest / "objects.parquet")) == 0
         newest.append(latest.resolve())
     assert newest[0] != newest[1]
     assert {path.name for path in runs.iterdir()} == {"latest", *(path.name for path in newest)}
@@ -508,7 +508,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.fixture(scope="session")
 def people(demo: tuple[Path, str]) -> pd.DataFrame:
     """Rows of all detected people, with centroids in the axes of the room: x right, y away, z up."""
-    table = pd.read_parquet(demo[0] / "dynamics.parquet")
+    table = pd.read_parquet(demo[0] / "objects.parquet")
     table = table[(table["class"] == "person") & ~table["missed"] & table["x"].notna()].copy()
     T_ge = np.array(json.loads((demo[0] / "metrics.json").read_text())["alignment"]["T_ge"])
     table[["x", "y", "z"]] = table[["x", "y", "z"]].to_numpy() @ T_ge[:3, :3].T + T_ge[:3, 3]

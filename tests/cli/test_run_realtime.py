@@ -90,7 +90,7 @@ def test_masks_from_files_need_no_network(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["failure"] is None and metrics["processed"] >= 1
-    assert pd.read_parquet(out / "dynamics.parquet")["class"].tolist()
+    assert pd.read_parquet(out / "objects.parquet")["class"].tolist()
 
 
 def test_live_run_cannot_be_resumed(moment: Path, tmp_path: Path) -> None:

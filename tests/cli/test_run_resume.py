@@ -24,6 +24,7 @@ from typer.testing import Result
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import run, run_command
+from v3d_torch.cli.run_summary import way_to_resume
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
@@ -84,7 +85,7 @@ def interrupt_run(sequence: Path, out: Path, frame: int, *more: str) -> Result:
 
 KILLS = (
     (partial(kill_while_tracking, 4), 3),
-    (partial(kill_before_renaming, RunFile.DYNAMICS, 3), 5),
+    (partial(kill_before_renaming, RunFile.OBJECTS, 3), 5),
     (partial(kill_before_renaming, RunFile.CHECKPOINT, 4), 9),
     (partial(kill_while_tracking, FRAMES - 8), FRAMES - 1),
     (partial(kill_before_renaming, RunFile.MAP, 1), FRAMES),
@@ -215,10 +216,10 @@ def test_run_on_a_disk_that_is_full_at_its_end_resumes_after_the_last_frame(
 def test_folder_in_the_way_to_resume_is_quoted(sequence: Path, tmp_path: Path) -> None:
     folder, frames = tmp_path / "my run", load_sequence(str(sequence))
     folder.mkdir()
-    assert run_command._way_to_resume(folder, frames) == ""
+    assert way_to_resume(folder, frames) == ""
     (folder / RunFile.CHECKPOINT).touch()
-    assert run_command._way_to_resume(folder, frames) == f"; resume with --resume '{folder}'"
-    assert run_command._way_to_resume(folder, RealtimePlayback(frames)) == ""  # its frames are gone
+    assert way_to_resume(folder, frames) == f"; resume with --resume '{folder}'"
+    assert way_to_resume(folder, RealtimePlayback(frames)) == ""  # its frames are gone
 
 
 def test_error_of_a_folder_that_becomes_locked_names_no_way_to_resume(

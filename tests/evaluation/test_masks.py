@@ -342,5 +342,5 @@ def test_run_is_scored_and_does_not_depend_on_ground_truth_masks(folder: Path, t
 
     shutil.rmtree(folder / "masks")
     assert run(folder, tmp_path / "unknown")["masks"] is None
-    for name in ("trajectory.txt", "keyframes.txt", "map.ply", "dynamics.parquet", "masks/1.000000.png"):
+    for name in ("trajectory.txt", "keyframes.txt", "map.ply", "objects.parquet", "masks/1.000000.png"):
         assert (tmp_path / "known" / name).read_bytes() == (tmp_path / "unknown" / name).read_bytes(), name

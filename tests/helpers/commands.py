@@ -18,12 +18,12 @@ from v3d_torch.cli import run
 
 RUN_FILES = {
     *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "request.yaml", "metrics.json", "run.log"),
-    *("frames.parquet", "states.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+    *("frames.parquet", "states.parquet", "objects.parquet", "map.ply", "trajectory.ply"),
     *("figures/trajectory.png", "figures/masks.png"),
 }
 """Files that every run with ground truth writes."""
 
-REPEATABLE_FILES = ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply", "trajectory.ply")
+REPEATABLE_FILES = ("trajectory.txt", "keyframes.txt", "objects.parquet", "map.ply", "trajectory.ply")
 """Files of every run that are the same to the byte if the run is repeated."""
 
 REPEATABLE_METRICS = (

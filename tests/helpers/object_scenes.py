@@ -379,7 +379,12 @@ class Run:
         return float(torch.cat([frame.result.static_mask[frame.owner == thing] for frame in frames]).double().mean())
 
 
-NO_FEATURES = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
+def support_without_residuals(pixel: Tensor, inliers: Tensor) -> FeatureSupport:
+    """Return features whose displacement is not known."""
+    return FeatureSupport(pixel, inliers, torch.full((len(pixel), 2), torch.nan, dtype=torch.float64))
+
+
+NO_FEATURES = support_without_residuals(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
 """Feature support of a frame without features: the simulated scenes have depth only."""
 
 
@@ -435,19 +440,19 @@ class ObjectStage:
         """
         guess = guess or Guess(T_wc)
         view = self._free_space_check.make_view(stamp, depth, invert(guess.T_wc), is_motion_measured=guess.is_measured)
-        newly_occupied = self._free_space_check(view, pose_known=guess.is_measured and not self._is_lost)
+        appeared_pixels = self._free_space_check(view, pose_known=guess.is_measured and not self._is_lost)
         if instances is None:
             instances = self._classify.propagate_instances(view)
         min_area = self._config.free_space.min_unlabelled_area
-        unlabelled = unlabelled_instances(newly_occupied, instances, depth, self._camera, min_area)
+        unlabelled = unlabelled_instances(appeared_pixels, instances, depth, self._camera, min_area)
         self.instances = instances.concatenate(unlabelled)
         clouds = self._back_project(depth if cloud_depth is None else cloud_depth, self.instances)
-        result = self._classify(self.instances, clouds, view, newly_occupied, self.feature_support)
+        result = self._classify(self.instances, clouds, view, appeared_pixels, self.feature_support)
         self._is_lost = not guess.is_found
         if guess.is_found:
             self._free_space_check.add_view(view, invert(T_wc))
-            self._classify.add_view(view, invert(T_wc), result.static_without_people)
-            self._classify.register(T_wc @ invert(guess.T_wc))
+            self._classify.add_view(view, invert(T_wc), result.map_mask)
+            self._classify.move_to_map(T_wc @ invert(guess.T_wc))
         return result
 
     def move_world(self, T_new_old: Tensor) -> None:

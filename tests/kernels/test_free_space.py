@@ -39,12 +39,12 @@ def test_free_space_of_points_equals_its_twin(camera: PinholeCamera, measured: f
 @pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("stride", [1, 4, 5])
 @pytest.mark.parametrize("measured", [0.0, 0.8])
-def test_newly_occupied_pixels_equal_their_twin(camera: PinholeCamera, stride: int, measured: float) -> None:
+def test_pixels_in_space_that_was_free_equal_their_twin(camera: PinholeCamera, stride: int, measured: float) -> None:
     rays = camera.rays[::stride, ::stride].reshape(-1, 3).T.to(torch.float64)
     earlier = [view(1.0, 0.1), None, view(0.5, 0.0)]
     found, expected = (
         f(view(measured, 0.0), earlier, rays, stride, camera, FreeSpaceConfig())
-        for f in TWINS[f"{free_space_check.__name__}._newly_occupied"]
+        for f in TWINS[f"{free_space_check.__name__}._was_free"]
     )
     assert torch.equal(found.nan_to_num(2), expected.nan_to_num(2))
 

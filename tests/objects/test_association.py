@@ -1,4 +1,4 @@
-"""Log-likelihood ratios of positions, masks, appearance, class and vacancy."""
+"""Log-likelihood ratios of positions, masks, appearance, class and vacated places."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from v3d_torch.objects.association import (
     class_log_ratio,
     overlap_log_ratio,
     position_log_ratio,
-    vacancy_log_ratio,
+    vacated_log_ratio,
 )
 
 
@@ -71,9 +71,9 @@ def test_appearance_is_weaker_evidence_after_some_time_and_for_a_small_part() ->
 
 def test_another_class_and_an_empty_place_are_evidence_against_a_track() -> None:
     assert class_log_ratio(torch.tensor([True, False])).tolist() == [0.0, -2.0]
-    assert [vacancy_log_ratio(seconds, 1e-4) for seconds in (0.1, 9.0)] == [-3.0, -6.0]
+    assert [vacated_log_ratio(seconds, 1e-4) for seconds in (0.1, 9.0)] == [-3.0, -6.0]
 
 
 def test_empty_place_is_weak_evidence_against_a_track_of_unknown_velocity() -> None:
     # Most of a normal distribution with a standard deviation of 0.9 m lies outside of the radius of 0.3 m.
-    assert vacancy_log_ratio(9.0, 0.81) == pytest.approx(-(0.3**2) / (2 * 0.81))
+    assert vacated_log_ratio(9.0, 0.81) == pytest.approx(-(0.3**2) / (2 * 0.81))

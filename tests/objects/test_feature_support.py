@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.object_scenes import support_without_residuals
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -24,7 +25,7 @@ def scene(fitting: float, outside: float = 0.5, count: int = 100) -> tuple[Featu
     inlier[count : count + round(outside * count)] = True
     mask = torch.zeros(1, HEIGHT, WIDTH, dtype=torch.bool)
     mask[:, :, : WIDTH // 2] = True
-    return FeatureSupport(torch.stack([columns, rows], dim=1), inlier), mask
+    return support_without_residuals(torch.stack([columns, rows], dim=1), inlier), mask
 
 
 @pytest.mark.parametrize(
@@ -60,7 +61,7 @@ def test_object_has_most_inliers_if_more_than_half_are_on_it(
 
 
 def test_no_features_and_no_objects_are_accepted() -> None:
-    no_features = FeatureSupport(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
+    no_features = support_without_residuals(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.bool))
     everything = torch.ones(2, HEIGHT, WIDTH, dtype=torch.bool)
     assert no_features.supports(no_features.on_objects(everything)).tolist() == [False, False]
     assert no_features.have_most_inliers(no_features.on_objects(everything)).tolist() == [False, False]
@@ -75,7 +76,7 @@ def test_features_on_objects_are_those_on_the_pixels_of_their_masks(
     generator = torch.Generator().manual_seed(seed)
     masks = torch.rand(3, height, width, generator=generator) > 0.5
     u, v = (torch.randint(0, size, (count,), generator=generator) for size in (width, height))
-    support = FeatureSupport(torch.stack([u, v], dim=1), torch.zeros(count, dtype=torch.bool))
+    support = support_without_residuals(torch.stack([u, v], dim=1), torch.zeros(count, dtype=torch.bool))
     assert torch.equal(support.on_objects(list(masks)), masks[:, v, u])
 
 
@@ -87,7 +88,7 @@ def test_support_equals_counting_one_by_one(seed: int, objects: int, fitting: fl
     pixel = torch.stack([torch.randint(0, n, (count,), generator=generator) for n in (WIDTH, HEIGHT)], dim=1)
     on_first = masks[0, pixel[:, 1], pixel[:, 0]]
     inlier = torch.rand(count, generator=generator) < torch.where(on_first, fitting / 2, fitting)
-    support = FeatureSupport(pixel, inlier)
+    support = support_without_residuals(pixel, inlier)
     supported_objects = support.supports(support.on_objects(masks))
     outside = [bool(f) for (u, v), f in zip(pixel.tolist(), inlier, strict=True) if not masks[:, v, u].any()]
     outside_ratio = sum(outside) / max(len(outside), 1)

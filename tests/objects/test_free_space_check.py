@@ -1,4 +1,4 @@
-"""Free-space check: vacated points, newly occupied pixels, and unknown ones."""
+"""Free-space check: vacated points, pixels that appeared, and unknown ones."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects import image_scale
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.free_space_check import (
     DepthView,
     FreeSpaceCheck,
     observe_free_space,
     vacated_fractions,
 )
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 CONFIG = FreeSpaceConfig()
@@ -260,10 +260,10 @@ def test_vacated_fractions_of_several_clouds_are_independent() -> None:
     assert vacated_fractions([], observed, CAMERA, CONFIG).shape == (0,)
 
 
-# ---------------------------------------------------------------- newly occupied pixels
+# ---------------------------------------------------------------- pixels that appeared
 
 BOX = 10, 20, 15, 25
-"""Rows and columns of the box in `NewlyOccupied`: rows 40 to 80, columns 60 to 100 of the image."""
+"""Rows and columns of the box in `AppearedPixels`: rows 40 to 80, columns 60 to 100 of the image."""
 WITH_BOX = ((60, 100), OBJECT)
 
 
@@ -298,7 +298,7 @@ def room(T_wc: Tensor, *, with_box: bool, at: float) -> DepthView:
 
 
 def test_new_box_has_appeared_and_the_wall_has_not() -> None:
-    appeared = check_with(view(at=0.0))(view(WITH_BOX, at=0.3)).appeared
+    appeared = check_with(view(at=0.0))(view(WITH_BOX, at=0.3)).was_free
     assert appeared.shape == (2, 30, 40) and appeared.dtype == torch.float64
     assert (box(appeared[0]) == 1).all()
     assert (around(appeared[0]) == 0).all()
@@ -307,75 +307,75 @@ def test_new_box_has_appeared_and_the_wall_has_not() -> None:
 
 def test_static_box_has_not_appeared() -> None:
     """At the rim of the box the wall was hidden, and its pixels are unknown."""
-    appeared = check_with(view(WITH_BOX, at=0.0))(view(WITH_BOX, at=0.9)).appeared
+    appeared = check_with(view(WITH_BOX, at=0.0))(view(WITH_BOX, at=0.9)).was_free
     assert (box(appeared) == 0).all() and (around(appeared) == 0).all()
     assert not (appeared == 1).any()
 
 
 def test_uncovered_wall_is_unknown() -> None:
     """The wall behind the box was hidden, so its pixels are unknown."""
-    appeared = check_with(view(WITH_BOX, at=0.0))(view(at=0.3)).appeared[0]
+    appeared = check_with(view(WITH_BOX, at=0.0))(view(at=0.3)).was_free[0]
     assert box(appeared).isnan().all()
     assert (around(appeared) == 0).all()
 
 
 def test_box_uncovered_by_a_screen_is_unknown() -> None:
-    appeared = check_with(view(((50, 110), 1.0), at=0.0))(view(WITH_BOX, at=0.3)).appeared[0]
+    appeared = check_with(view(((50, 110), 1.0), at=0.0))(view(WITH_BOX, at=0.3)).was_free[0]
     assert box(appeared).isnan().all()
 
 
 def test_pixels_outside_of_the_earlier_view_are_unknown() -> None:
     turned = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, math.pi / 2, 0.0], dtype=torch.float64))
-    assert check_with(view(at=0.0, T_wc=turned))(view(WITH_BOX, at=0.3)).appeared.isnan().all()
+    assert check_with(view(at=0.0, T_wc=turned))(view(WITH_BOX, at=0.3)).was_free.isnan().all()
 
 
 def test_pixels_without_earlier_depth_are_unknown() -> None:
-    assert check_with(view(wall=0.0, at=0.0))(view(WITH_BOX, at=0.3)).appeared.isnan().all()
+    assert check_with(view(wall=0.0, at=0.0))(view(WITH_BOX, at=0.3)).was_free.isnan().all()
 
 
 @pytest.mark.parametrize(("z", "known"), [(0.0, False), (0.29, False), (0.31, True), (2.9, True), (3.1, False)])
 def test_pixels_outside_of_the_depth_range_are_unknown(z: float, known: bool) -> None:
-    appeared = check_with(view(at=0.0), max_depth=3.0)(view(((60, 100), z), at=0.3)).appeared[0]
+    appeared = check_with(view(at=0.0), max_depth=3.0)(view(((60, 100), z), at=0.3)).was_free[0]
     assert (~box(appeared).isnan()).all() if known else box(appeared).isnan().all()
     assert around(appeared).isnan().all()  # the wall is beyond the maximum depth
 
 
 def test_all_pixels_are_unknown_without_stored_views() -> None:
-    assert check_with()(view(WITH_BOX)).appeared.isnan().all()
+    assert check_with()(view(WITH_BOX)).was_free.isnan().all()
 
 
 def test_view_is_not_compared_with_itself() -> None:
     observed = view(WITH_BOX, at=0.0)
-    assert check_with(observed)(observed).appeared.isnan().all()
+    assert check_with(observed)(observed).was_free.isnan().all()
 
 
 def test_disabled_check_compares_nothing() -> None:
-    newly_occupied = check_with(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
-    assert newly_occupied.appeared.shape == (0, 30, 40)
-    assert newly_occupied.fractions([torch.ones(120, 160, dtype=torch.bool)], [1], [False]).shape == (1, 0)
+    appeared_pixels = check_with(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
+    assert appeared_pixels.was_free.shape == (0, 30, 40)
+    assert appeared_pixels.fractions([torch.ones(120, 160, dtype=torch.bool)], [1], [False]).shape == (1, 0)
 
 
 def test_view_with_guessed_pose_is_not_compared() -> None:
     check, current = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
-    assert check(current, pose_known=False).appeared.numel() == 0
-    assert check(current).appeared.shape[0] == 2
+    assert check(current, pose_known=False).was_free.numel() == 0
+    assert check(current).was_free.shape[0] == 2
 
 
 def test_dropped_views_are_not_compared() -> None:
     check, current = check_with(view(at=0.0)), view(WITH_BOX, at=0.9)
-    assert not check(current).appeared.isnan().all()
+    assert not check(current).was_free.isnan().all()
     check.drop_views()
-    assert check(current).appeared.isnan().all()
+    assert check(current).was_free.isnan().all()
 
 
 @pytest.mark.parametrize("rate", [5, 10, 30])
-def test_box_is_newly_occupied_over_each_time_span(rate: int) -> None:
-    """The box appears at 2 s, and is newly occupied over each time span for as long as it."""
+def test_box_has_appeared_over_each_time_span(rate: int) -> None:
+    """The box appears at 2 s, and has appeared over each time span for as long as it."""
     check = check_with()
     steps = {time_span: -(-round(time_span * 1000) * rate // 1000) for time_span in (0.3, 0.9)}  # whole frames
     for frame in range(4 * rate):
         current = view(*[WITH_BOX] * (frame >= 2 * rate), at=frame / rate)
-        appeared = check(current).appeared
+        appeared = check(current).was_free
         for row, time_span in zip(appeared, (0.3, 0.9), strict=True):
             expected = 2 * rate <= frame < 2 * rate + steps[time_span]
             if frame < steps[time_span]:
@@ -389,7 +389,7 @@ def test_view_is_compared_with_the_newest_one_that_is_older_by_the_time_span() -
     """Stamps of the same time differ by rounding; a view that is half a frame too new is not meant."""
     old = 0.1 + 0.2
     assert old > 0.6 - 0.3
-    appeared = check_with(view(at=old), view(WITH_BOX, at=old + 0.015))(view(WITH_BOX, at=0.6)).appeared[0]
+    appeared = check_with(view(at=old), view(WITH_BOX, at=old + 0.015))(view(WITH_BOX, at=0.6)).was_free[0]
     assert (box(appeared) == 1).all()
 
 
@@ -413,7 +413,7 @@ MOVES = [(0.3, 0.0, 0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.5, 0.0, 0.0, 0.0), (0.1, -
 def test_nothing_appears_in_a_static_room_under_camera_motion(twist: tuple[float, ...]) -> None:
     T_wc = se3_exp(torch.tensor(twist, dtype=torch.float64))
     for previous, current in ((HERE, T_wc), (T_wc, HERE)):
-        appeared = check_with(room(previous, with_box=True, at=0.0))(room(current, with_box=True, at=0.3)).appeared[0]
+        appeared = check_with(room(previous, with_box=True, at=0.0))(room(current, with_box=True, at=0.3)).was_free[0]
         assert not (appeared == 1).any()
         assert (appeared == 0).double().mean() > 0.6
 
@@ -422,7 +422,7 @@ def test_nothing_appears_in_a_static_room_under_camera_motion(twist: tuple[float
 def test_new_box_appears_under_camera_motion(twist: tuple[float, ...]) -> None:
     T_wc = se3_exp(torch.tensor(twist, dtype=torch.float64))
     current = room(T_wc, with_box=True, at=0.3)
-    appeared = check_with(room(HERE, with_box=False, at=0.0))(current).appeared[0]
+    appeared = check_with(room(HERE, with_box=False, at=0.0))(current).was_free[0]
     on_box = current.depth[0, ::4, ::4] < 3.0
     assert on_box.sum() > 80
     assert torch.equal(appeared == 1, on_box)
@@ -431,13 +431,13 @@ def test_new_box_appears_under_camera_motion(twist: tuple[float, ...]) -> None:
 @settings(max_examples=20)
 @given(TWISTS)
 def test_world_correction_moves_the_stored_views(twist: tuple[float, ...]) -> None:
-    """A loop correction moves the map and the camera: the newly occupied pixels stay the same."""
+    """A loop correction moves the map and the camera: the pixels that appeared stay the same."""
     T_new_old = se3_exp(torch.tensor(twist, dtype=torch.float64))
     check = check_with(view(at=0.0), view(WITH_BOX, at=0.6))
-    expected = check(view(WITH_BOX, at=0.9)).appeared
+    expected = check(view(WITH_BOX, at=0.9)).was_free
     assert (box(expected[0]) == 0).all() and (box(expected[1]) == 1).all()
     check.apply_world_correction(T_new_old)
-    appeared = check(view(WITH_BOX, at=0.9, T_wc=T_new_old)).appeared
+    appeared = check(view(WITH_BOX, at=0.9, T_wc=T_new_old)).was_free
     torch.testing.assert_close(appeared, expected, rtol=0, atol=0, equal_nan=True)
 
 
@@ -453,7 +453,7 @@ def test_fraction_of_an_object_is_that_of_its_known_or_of_all_its_pixels(
     appeared = rng.choice([0.0, 1.0, np.nan], (rows, 7, 9), p=[0.3, 0.2, 0.5])
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
     of_all = [bool(rng.random() < 0.5) for _ in masks]
-    fractions = NewlyOccupied(torch.from_numpy(appeared), stride).fractions(
+    fractions = AppearedPixels(torch.from_numpy(appeared), stride).fractions(
         [torch.from_numpy(mask) for mask in masks], 3 * [min_pixels], of_all
     )
     assert fractions.dtype == torch.float64 and fractions.shape == (3, rows)
@@ -470,12 +470,12 @@ def test_fraction_of_an_object_is_that_of_its_known_or_of_all_its_pixels(
 
 def test_fraction_of_half_a_box_is_one_half() -> None:
     """The mask covers the box that appeared and an equal area of the static wall beside it."""
-    newly_occupied = check_with(view(at=0.0))(view(WITH_BOX, at=0.3))
+    appeared_pixels = check_with(view(at=0.0))(view(WITH_BOX, at=0.3))
     mask = torch.zeros(120, 160, dtype=torch.bool)
     mask[40:80, 60:140] = True
-    (fractions,) = newly_occupied.fractions([mask], [CONFIG.min_points], [False])
+    (fractions,) = appeared_pixels.fractions([mask], [CONFIG.min_points], [False])
     assert fractions[0] == 0.5 and fractions[1].isnan()
-    assert newly_occupied.fractions([mask], [201], [False])[0, 0].isnan()
+    assert appeared_pixels.fractions([mask], [201], [False])[0, 0].isnan()
 
 
 # ---------------------------------------------------------------- state
@@ -489,8 +489,8 @@ def test_state_dict_continues_with_identical_results() -> None:
         other = continued.make_view(stamp, view(WITH_BOX).depth, turned(stamp))
         assert current.misalignment == other.misalignment
         torch.testing.assert_close(
-            original(current).appeared, continued(other).appeared, rtol=0, atol=0, equal_nan=True
+            original(current).was_free, continued(other).was_free, rtol=0, atol=0, equal_nan=True
         )
         original.add_view(current, current.T_dw)
         continued.add_view(other, other.T_dw)
-    assert not original(view(WITH_BOX, at=1.8)).appeared.isnan().all()
+    assert not original(view(WITH_BOX, at=1.8)).was_free.isnan().all()

@@ -680,14 +680,14 @@ def test_end_of_a_guess_moves_what_was_seen_since_or_all(guesses: tuple[int, ...
     offset[0, 3] = 0.3
     for frame in range(8):
         if frame in guesses:
-            track_boards.tracker.start_unregistered(frame / 30)
+            track_boards.tracker.start_guessed_world(frame / 30)
         depth, instances = render([Board(0.0)], HERE)
         (track,) = track_boards.track(depth, instances, frame / 30, T_wc=offset if frame >= 5 else HERE)
     assert track_boards.tracker.comparable_since == guesses[-1] / 30
-    track_boards.tracker.register(invert(offset), all_tracks=all_tracks)
+    track_boards.tracker.move_to_map(invert(offset), all_tracks=all_tracks)
     places = [round(float(detection.centroid[0]), 2) for detection in track.detections]
     assert places == (5 * [-0.3] + 3 * [0.0] if all_tracks else 8 * [0.0])
-    track_boards.tracker.register(offset)  # no guess any more
+    track_boards.tracker.move_to_map(offset)  # no guess any more
     assert [round(float(detection.centroid[0]), 2) for detection in track.detections] == places
     assert all_tracks or float(track.velocity.norm()) < 0.05
 
@@ -791,11 +791,11 @@ def test_end_of_a_guess_keeps_the_position_that_the_refined_mask_shows() -> None
     track_boards, offset = BoardTracker(), HERE.clone()
     offset[0, 3] = 0.3
     track_boards(Board(0.0))
-    track_boards.tracker.start_unregistered(1 / 30)
+    track_boards.tracker.start_guessed_world(1 / 30)
     (track,) = track_boards.track(*render([Board(0.0)], HERE), 1 / 30, T_wc=offset)
     surface = torch.tensor([0.4, 0.1, 2.0], dtype=torch.float64)
     track.record_visible_state(surface)
-    track_boards.tracker.register(invert(offset))
+    track_boards.tracker.move_to_map(invert(offset))
     expected = surface - offset[:3, 3]
     torch.testing.assert_close(track.predict_visible_state(1 / 30).position, expected)
     torch.testing.assert_close(track.history[-1].position, expected)

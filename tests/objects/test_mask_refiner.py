@@ -11,9 +11,9 @@ from v3d_torch.config import CloudConfig, FreeSpaceConfig, ObjectsConfig, Static
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import pack_masks
 from v3d_torch.objects import mask_refiner
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.mask_refiner import MaskRefiner
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.segmentation.coco import PERSON
@@ -75,7 +75,7 @@ def refine(
     if static is not None:
         surfaces.add_view(view, view.T_dw, static)
     config = ObjectsConfig(clouds=CloudConfig(voxel_size=SPACING), static_mask=StaticMaskConfig(**mask))
-    refiner = MaskRefiner([track], view, NewlyOccupied(appeared, STEP), surfaces, config, CAMERA)
+    refiner = MaskRefiner([track], view, AppearedPixels(appeared, STEP), surfaces, config, CAMERA)
     refined = refiner.refine(track)
     image = torch.zeros_like(segmented)
     image[refined.crop] = torch.from_numpy(refined.surface if surface_only else refined.mask)
@@ -135,7 +135,7 @@ def test_surface_much_larger_than_the_object_is_excluded() -> None:
     )
 
 
-def test_previously_occupied_surface_is_excluded() -> None:
+def test_surface_that_was_there_before_is_excluded() -> None:
     appeared = torch.full((2, CAMERA.height // STEP, CAMERA.width // STEP), torch.nan, dtype=torch.float64)
     appeared[0, 160 // STEP :] = 0.0
     assert abs(rows_below_cut(refine(depth_of(), appeared, surface_margin=100)) - (160 - CUT)) <= STEP

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.differences import differences
-from helpers.object_scenes import NO_FEATURES, ObjectStage
+from helpers.object_scenes import NO_FEATURES, ObjectStage, support_without_residuals
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
@@ -438,7 +438,7 @@ def test_person_with_supporting_features_is_static_after_a_third_of_a_second(
     fits[on_person] &= torch.rand(int(on_person.sum()), generator=torch.Generator().manual_seed(1)) < fitting
     stage = ObjectStage(ObjectsConfig())
     for frame in range(9):
-        stage.feature_support = FeatureSupport(pixel, fits & ~on_person if frame == interruption else fits)
+        stage.feature_support = support_without_residuals(pixel, fits & ~on_person if frame == interruption else fits)
         (obj,) = stage(frame / 30, person, depth, HERE).objects
         assert obj.motion_state is MotionState.UNKNOWN
     (obj,) = stage(9 / 30, person, depth, HERE).objects
@@ -494,7 +494,7 @@ def test_thing_with_most_inliers_of_the_camera_motion_is_static(
     fits = on_thing.clone()
     fits[others] = True
     stage = ObjectStage(ObjectsConfig())
-    stage.feature_support = FeatureSupport(features, fits)
+    stage.feature_support = support_without_residuals(features, fits)
     for frame in range(40):
         depth = torch.full((1, CAMERA.height, CAMERA.width), 3.0)
         depth[mask] = 2.0 - 0.02 * frame
@@ -715,8 +715,8 @@ def test_static_person_is_in_static_mask_but_not_in_mask_without_people() -> Non
     assert frame[2].motion_state is MotionState.STATIC
     assert result.static_mask.all()
     distance = distance_to(frame.owner == 1)
-    assert not result.static_without_people[distance <= 3].any()
-    assert result.static_without_people[distance >= 5].all()
+    assert not result.map_mask[distance <= 3].any()
+    assert result.map_mask[distance >= 5].all()
 
 
 def test_missed_walker_continues_as_unlabelled_instance() -> None:

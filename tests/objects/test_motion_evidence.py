@@ -8,9 +8,9 @@ import torch
 from v3d_torch.config import FreeSpaceConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import pack_masks
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.motion_evidence import free_space_evidence
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.track import Track
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 
@@ -22,7 +22,7 @@ STRIDE = 4
 def test_object_has_appeared_only_if_enough_of_its_pixels_are_known(label: int, fewest: int) -> None:
     """A region without a class consists of new pixels, so that fewer of them are enough."""
     view = DepthView(0.0, torch.full((1, 120, 160), 3.0), torch.eye(4, dtype=torch.float64))
-    appeared = NewlyOccupied(torch.ones(1, 30, 40, dtype=torch.float64), STRIDE)
+    appeared = AppearedPixels(torch.ones(1, 30, 40, dtype=torch.float64), STRIDE)
     for count in (fewest - 1, fewest):
         mask = torch.zeros(120, 160, dtype=torch.bool)
         mask[:STRIDE, : STRIDE * count] = True

@@ -82,21 +82,21 @@ def test_empty_place_is_no_evidence_against_the_return_of_a_lost_track() -> None
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
     detected = detect_instances(1.0, instances, clouds, None, HERE, 1)
     before = compare_without_masks([track], detected, TrackerConfig())
-    track.add_vacancy(0.3, 0.3)
-    assert track.vacancy < 0
+    track.add_vacated_time(0.3, 0.3)
+    assert track.vacated_evidence < 0
     assert torch.equal(compare_without_masks([track], detected, TrackerConfig()), before)
 
 
 def test_evidence_of_an_empty_place_starts_anew_with_each_detection() -> None:
     found = []
-    for was_vacant in (False, True):
+    for was_vacated in (False, True):
         track_boards = BoardTracker()
         (track,) = track_boards(Board(0.0))
-        if was_vacant:
-            track.add_vacancy(0.02, 0.02)
+        if was_vacated:
+            track.add_vacated_time(0.02, 0.02)
         track_boards(Board(0.0))
-        track.add_vacancy(0.04, 0.01)
-        found.append((track.vacant_time, track.vacancy))
+        track.add_vacated_time(0.04, 0.01)
+        found.append((track.vacated_time, track.vacated_evidence))
     assert found[0] == found[1] and found[0][1] < 0
 
 

@@ -147,7 +147,7 @@ def test_point_that_all_views_see_through_is_never_occupied(
         view = RangeView.sample(number, noisy, ALL, CONFIG.stride)
         twist = torch.tensor([0.0, 0.0, 0.0, 0.0, turn * number / 3, 0.0], dtype=torch.float64)
         occupancy.integrate(view.depth, view.static, view.rays(CAMERA, CONFIG.stride), se3_exp(twist))
-    clear = distance - SIZE * 3**0.5 - SIZE / 2 - CONFIG.depth_tolerance * distance**2 - 0.02
+    clear = distance - SIZE * 3**0.5 - SIZE / 2 - CONFIG.inverse_depth_tolerance * distance**2 - 0.02
     points = CAMERA.rays[40:200:20, 80:240:20].reshape(-1, 3).double() * fraction * clear
     assert (occupancy.states(points) != VoxelState.OCCUPIED).all()
 

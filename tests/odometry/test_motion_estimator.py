@@ -17,7 +17,7 @@ def test_convention_motion_maps_points_of_a_to_b() -> None:
     motion = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
     assert motion is not None
     assert torch.allclose(motion.T_ba, T_ba, atol=1e-6)
-    assert motion.pairs.shape == (400, 2)
+    assert motion.inlier_matches.shape == (400, 2)
 
 
 def test_motion_is_correct_with_a_third_of_outliers() -> None:
@@ -25,7 +25,7 @@ def test_motion_is_correct_with_a_third_of_outliers() -> None:
     motion = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)(a, b)
     assert motion is not None
     assert torch.allclose(motion.T_ba, T_ba, atol=5e-3)
-    assert (motion.pairs[:, 0] >= 270).sum() < 10
+    assert (motion.inlier_matches[:, 0] >= 270).sum() < 10
 
 
 def test_with_a_prediction_a_limited_number_of_features_is_matched() -> None:
@@ -33,11 +33,11 @@ def test_with_a_prediction_a_limited_number_of_features_is_matched() -> None:
     config = Config().odometry.model_copy(update={"max_features": 50})
     estimate = MotionEstimator(config, Config().features, CAMERA, seed=0)
     alone, predicted = estimate(a, b), estimate(a, b, initial_guess=T_ba)
-    assert alone is not None and len(alone.pairs) == 400
-    assert predicted is not None and 20 <= len(predicted.pairs) <= 50
+    assert alone is not None and len(alone.inlier_matches) == 400
+    assert predicted is not None and 20 <= len(predicted.inlier_matches) <= 50
     assert torch.allclose(predicted.T_ba, T_ba, atol=1e-6)
     extent = a.uv.amax(dim=0) - a.uv.amin(dim=0)
-    matched = a.uv[predicted.pairs[:, 0]]
+    matched = a.uv[predicted.inlier_matches[:, 0]]
     assert bool((matched.amax(dim=0) - matched.amin(dim=0) > 0.8 * extent).all())  # spread over the image
 
 
@@ -57,7 +57,7 @@ def test_number_of_matched_features_is_limited_with_an_initial_guess() -> None:
     estimate = MotionEstimator(config, Config().features, CAMERA, seed=0)
     limited, unlimited = estimate(a, b, initial_guess=T_ba), estimate(a, b)
     assert limited is not None and unlimited is not None
-    assert len(limited.matches) == len(limited.pairs) == 50 and len(unlimited.matches) == 400
+    assert len(limited.matches) == len(limited.inlier_matches) == 50 and len(unlimited.matches) == 400
     cells = a.pixel[limited.matches[:, 0]] // Config().features.cell
     assert len(cells.unique(dim=0)) == 50
     assert torch.allclose(limited.T_ba, T_ba, atol=1e-6)

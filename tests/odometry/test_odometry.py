@@ -62,14 +62,14 @@ def two_frames(demo: RGBDSequence, previous: int, current: int, *overrides: str)
 def test_dense_alignment_gives_the_motion_without_features(demo: RGBDSequence, current: int) -> None:
     frames = two_frames(demo, 0, current, NO_FEATURES)
     motion = frames.estimate()
-    assert motion.is_measured and motion.pairs.shape == (0, 2)
+    assert motion.is_measured and motion.inlier_matches.shape == (0, 2)
     error = se3_log(motion.T_cp @ invert(frames.T_cp))
     assert float(error[:3].norm()) < 0.003 and float(error[3:].norm()) < 0.002
 
 
 def test_features_are_tried_first(demo: RGBDSequence) -> None:
     motion = two_frames(demo, 0, 1).estimate()
-    assert motion.is_measured and len(motion.pairs) > 100
+    assert motion.is_measured and len(motion.inlier_matches) > 100
 
 
 @pytest.mark.parametrize("overrides", [(), (NO_FEATURES,)], ids=["features", "dense"])
@@ -85,7 +85,7 @@ def test_measured_motion_is_that_of_the_registration(demo: RGBDSequence) -> None
     motion = frames.estimate()
     registered = frames.odometry.register(frames.previous, frames.current, PREDICTED_T_CP)
     assert registered is not None
-    assert torch.equal(motion.T_cp, registered.T_ba) and torch.equal(motion.pairs, registered.pairs)
+    assert torch.equal(motion.T_cp, registered.T_ba) and torch.equal(motion.inlier_matches, registered.inlier_matches)
 
 
 def test_implausible_motion_is_rejected_and_the_prediction_returned(demo: RGBDSequence) -> None:
@@ -100,14 +100,16 @@ def test_motion_of_the_first_frame_is_the_prediction(demo: RGBDSequence) -> None
 
 
 def assert_predicted(motion: CameraMotion) -> None:
-    assert not motion.is_measured and motion.pairs.shape == (0, 2) and motion.pairs.dtype == torch.int64
+    assert (
+        not motion.is_measured and motion.inlier_matches.shape == (0, 2) and motion.inlier_matches.dtype == torch.int64
+    )
     assert torch.equal(motion.T_cp, PREDICTED_T_CP) and torch.equal(motion.velocity, PREDICTED_VELOCITY)
 
 
 def test_inlier_mask_selects_the_matched_features_of_the_current_frame() -> None:
     motion = CameraMotion(PREDICTED_T_CP, PREDICTED_VELOCITY, PAIRS, is_measured=True)
     assert motion.inlier_mask(7).tolist() == [True, False, False, True, False, True, False]
-    assert not replace(motion, pairs=PAIRS[:0]).inlier_mask(7).any()
+    assert not replace(motion, inlier_matches=PAIRS[:0]).inlier_mask(7).any()
 
 
 def test_residuals_are_displacements_against_the_motion(demo: RGBDSequence) -> None:

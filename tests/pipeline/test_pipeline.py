@@ -57,9 +57,9 @@ def test_callback_and_record_have_every_frame_and_object() -> None:
     pipeline = make_pipeline()
     record = pipeline(on_frame)
     assert reported == [(index, 1, TrackingStatus.TRACKED) for index in range(FRAMES)]
-    assert record.dynamics["frame"].tolist() == list(range(FRAMES))
-    assert set(record.dynamics["label"].tolist()) == {PERSON}
-    assert float(record.dynamics["centroid"][-1, 2]) == pytest.approx(WALL, abs=0.02)
+    assert record.objects["frame"].tolist() == list(range(FRAMES))
+    assert set(record.objects["label"].tolist()) == {PERSON}
+    assert float(record.objects["centroid"][-1, 2]) == pytest.approx(WALL, abs=0.02)
     assert (stamps := [snapshot.frame.stamp for snapshot in record.snapshots]) == sorted(stamps)
     assert len(record.snapshots) == 6
     assert set(pipeline.slam.timer.seconds) >= {"read", "segmentation", "objects", "tracking", "mapping"}
@@ -175,7 +175,7 @@ def test_broken_frame_ends_the_run_and_keeps_the_frames_before(broken: int, tmp_
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert (metrics["processed"], metrics["frames"]) == (broken, FRAMES)
     assert metrics["failure"] == record.failure
-    assert (tmp_path / "map.ply").is_file() and (tmp_path / "dynamics.parquet").is_file()
+    assert (tmp_path / "map.ply").is_file() and (tmp_path / "objects.parquet").is_file()
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -225,7 +225,7 @@ def test_frame_that_is_interrupted_after_its_pose_was_stored_has_no_row_in_the_t
     assert len(pipeline.slam.poses) == 5
     pipeline.flush()
     write_results(tmp_path, pipeline)
-    for name in ("frames", "states", "dynamics"):
+    for name in ("frames", "states", "objects"):
         assert len(pq.read_table(tmp_path / f"{name}.parquet")) == 4, name
 
 
@@ -259,17 +259,17 @@ def test_maps_leave_out_more_pixels_than_tracking_in_mask_images_and_views(tmp_p
     pipeline(lambda frame, result: results.update({frame.stamp: result}))
     assert len(results) == FRAMES and len(pipeline.views) > 1
     for stamp, result in results.items():
-        assert bool((result.static_mask & ~result.static_without_people).any())
-        assert_is_square(~result.static_without_people, margin=6)
+        assert bool((result.static_mask & ~result.map_mask).any())
+        assert_is_square(~result.map_mask, margin=6)
         if result.objects[0].motion_state is MotionState.STATIC:
             assert result.static_mask.all()
         else:
             assert_is_square(~result.static_mask, margin=5)
-        for folder, static in (("masks", result.static_mask), ("map_masks", result.static_without_people)):
+        for folder, static in (("masks", result.static_mask), ("map_masks", result.map_mask)):
             image = cv2.imread(str(tmp_path / folder / f"{stamp:.6f}.png"), cv2.IMREAD_UNCHANGED)
             assert np.array_equal(image == 0, static.numpy())
     for view in pipeline.views:
-        static = results[view.keyframe.stamp].static_without_people
+        static = results[view.keyframe.stamp].map_mask
         assert torch.equal(view.depth > 0, static[:: pipeline.views.stride, :: pipeline.views.stride])
         assert view.depth_delay == 0.01
 

@@ -28,7 +28,7 @@ def scattered_points(seed: int, extent: float) -> Tensor:
 @pytest.mark.parametrize("tolerance", [0.01, 0.5])
 @pytest.mark.parametrize("extent", [16.0, 160.0])
 def test_no_point_that_a_view_observes_is_left_out(extent: float, tolerance: float) -> None:
-    points, config = scattered_points(0, extent), FreeSpaceConfig(tolerance=tolerance)
+    points, config = scattered_points(0, extent), FreeSpaceConfig(inverse_depth_tolerance=tolerance)
     blocks = PointBlocks(points)
     observed = left_out = 0
     for k, T_wc in enumerate(looking_around(24)):

@@ -39,9 +39,9 @@ def test_sequence_exercises_all_state(uninterrupted: Pipeline) -> None:
     assert {TrackingStatus.TRACKED, TrackingStatus.LOST} <= set(slam.poses.statuses)
     assert slam.loop_closer.loop_count > 0 and len(slam.map.keyframes) > 10
     assert not slam.map.landmarks["active"].all()
-    assert {PERSON, UNLABELLED} <= set(record.dynamics["label"].tolist())
-    assert {MotionState.DYNAMIC, MotionState.STATIC} <= record.dynamics.count_motion_states().keys()
-    assert record.dynamics["missed"].any() and record.dynamics["votes"].any()
+    assert {PERSON, UNLABELLED} <= set(record.objects["label"].tolist())
+    assert {MotionState.DYNAMIC, MotionState.STATIC} <= record.objects.count_motion_states().keys()
+    assert record.objects["missed"].any() and record.objects["votes"].any()
     state = segmenter_state_of(slam.segment)
     assert state is not None and state["calls"] > 10 and state["up"].norm() > 1
 
@@ -101,7 +101,7 @@ def test_run_whose_results_cannot_be_written_when_interrupted_resumes_exactly(
         run(interrupt)
     checkpoint = read_checkpoint(folder)
     Run(request, walk, UprightSegmenter(segment_red), again, checkpoint=checkpoint)(lambda *_: None)
-    for name in ("trajectory.txt", "keyframes.txt", "dynamics.parquet", "map.ply"):
+    for name in ("trajectory.txt", "keyframes.txt", "objects.parquet", "map.ply"):
         assert (again / name).read_bytes() == (whole / name).read_bytes(), name
 
 

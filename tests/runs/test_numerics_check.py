@@ -20,8 +20,8 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.errors import NumericsError
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.frame_objects import MotionState, TrackedObject
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.runs.numerics_check import CheckedSLAM, CheckedStage, check_finite
@@ -39,7 +39,7 @@ class Pair(NamedTuple):
 
 
 @dataclass(frozen=True)
-class TimedNewlyOccupied(NewlyOccupied):
+class TimedPixels(AppearedPixels):
     seconds: float = 0.0
 
 
@@ -56,7 +56,7 @@ class TimedNewlyOccupied(NewlyOccupied):
         (lambda x: (1, None, "inf", [0.0, x]), r"x\[3\]\[1\] is"),
         (lambda x: {"here": torch.zeros(2), "there": torch.tensor(x)}, r"x\['there'\] is"),
         (lambda x: Pair(torch.zeros(3), x), r"x\.far is"),
-        (lambda x: TimedNewlyOccupied(torch.zeros(1), 4, x), r"x\.seconds is"),
+        (lambda x: TimedPixels(torch.zeros(1), 4, x), r"x\.seconds is"),
         (lambda x: RGBDFrame(0, x, torch.zeros(3, 1, 1, dtype=torch.uint8), torch.zeros(1, 1, 1)), r"x\.stamp is"),
     ],
 )
@@ -70,11 +70,9 @@ def test_non_finite_numbers_are_found_at_any_depth(
 
 
 def test_documented_nan_is_accepted_and_infinity_is_not() -> None:
-    check_finite(
-        "x", [NewlyOccupied(torch.tensor([math.nan, 1.0]), 4), TimedNewlyOccupied(torch.tensor([math.nan]), 4)]
-    )
-    with pytest.raises(NumericsError, match=r"x\.appeared is infinite: 1 of 2"):
-        check_finite("x", NewlyOccupied(torch.tensor([math.nan, math.inf]), 4))
+    check_finite("x", [AppearedPixels(torch.tensor([math.nan, 1.0]), 4), TimedPixels(torch.tensor([math.nan]), 4)])
+    with pytest.raises(NumericsError, match=r"x\.was_free is infinite: 1 of 2"):
+        check_finite("x", AppearedPixels(torch.tensor([math.nan, math.inf]), 4))
 
 
 def test_documented_infinity_is_accepted_and_nan_is_not() -> None:
@@ -87,7 +85,7 @@ def test_documented_infinity_is_accepted_and_nan_is_not() -> None:
 
 def test_integers_and_other_types_are_ignored() -> None:
     check_finite(
-        "x", [torch.tensor([1, 2]), torch.tensor([True]), 3, "nan", b"nan", None, object(), float, NewlyOccupied]
+        "x", [torch.tensor([1, 2]), torch.tensor([True]), 3, "nan", b"nan", None, object(), float, AppearedPixels]
     )
 
 

@@ -55,7 +55,7 @@ def test_all_documented_files_are_written(results: Path) -> None:
     names = {str(path.relative_to(results)) for path in results.rglob("*") if path.is_file()}
     assert names == {
         *("trajectory.txt", "keyframes.txt", "groundtruth.txt", "config.yaml", "metrics.json"),
-        *("frames.parquet", "states.parquet", "dynamics.parquet", "map.ply", "trajectory.ply"),
+        *("frames.parquet", "states.parquet", "objects.parquet", "map.ply", "trajectory.ply"),
         *(
             "figures/trajectory.png",
             "figures/masks.png",
@@ -169,14 +169,14 @@ def test_ground_truth_is_written_and_gives_the_same_scores(results: Path, run: P
 
 
 def test_object_table_has_a_row_per_frame_and_object(results: Path, run: Pipeline) -> None:
-    table = pq.read_table(results / "dynamics.parquet").to_pandas()
+    table = pq.read_table(results / "objects.parquet").to_pandas()
     assert list(table.columns) == [
         *("frame", "stamp", "id", "class", "x", "y", "z", "vx", "vy", "vz", "position_sigma", "velocity_sigma"),
         *("box_x", "box_y", "box_z", "box_length", "box_width", "box_height", "box_yaw"),
         *("votes", "chamfer", "motion_state", "missed"),
     ]
     assert (table[["position_sigma", "velocity_sigma", "box_height"]] > 0).all(axis=None)
-    assert len(table) == len(run.record.dynamics) == FRAMES
+    assert len(table) == len(run.record.objects) == FRAMES
     assert table["frame"].tolist() == list(range(FRAMES))
     assert np.allclose(table["stamp"], run.sequence.stamps.numpy())
     assert set(table["motion_state"]) <= {"static", "dynamic", "deforming", "unknown"}
@@ -308,7 +308,7 @@ def test_repeated_run_writes_identical_files(results: Path, tmp_path: Path) -> N
     again = run_along_wall()
     again.flush()
     write_results(tmp_path, again)
-    for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "dynamics.parquet"):
+    for name in ("trajectory.txt", "keyframes.txt", "config.yaml", "map.ply", "objects.parquet"):
         assert (tmp_path / name).read_bytes() == (results / name).read_bytes(), name
 
 

@@ -44,7 +44,7 @@ def test_poses_and_sparse_map_are_written_before_the_point_map_is_fused(
     with pytest.raises(MemoryError):
         run(lambda *_: None)
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == FRAMES
-    assert {"states.parquet", "dynamics.parquet", "room.npz"} <= {path.name for path in tmp_path.iterdir()}
+    assert {"states.parquet", "objects.parquet", "room.npz"} <= {path.name for path in tmp_path.iterdir()}
     failure = read_metrics(tmp_path / "metrics.json").failure
     assert failure == f"killed or still running after {FRAMES} of {FRAMES} frames"
 

@@ -21,7 +21,8 @@ from v3d_torch.odometry.odometry import Odometry
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.stages.stage_checks import STAGES, ReplacedStage
+from v3d_torch.stages.replaceable_stages import STAGES
+from v3d_torch.stages.stage_checks import ReplacedStage
 from v3d_torch.types import Instances, RGBDFrame
 
 CAMERA = PinholeCamera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
@@ -78,11 +79,15 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
     ("odometry", lambda motion: motion.T_cp, "odometry returned a Tensor; it must return CameraMotion"),
     ("odometry", change(T_cp=lambda x: x[:3]), r"odometry\.T_cp is torch.float64 of shape \(3, 4\), .* \(4, 4\)"),
     ("odometry", change(velocity=torch.Tensor.float), r"odometry\.velocity is torch.float32 of shape \(6,\), expected"),
-    ("odometry", change(pairs=lambda x: x.T), r"odometry\.pairs is torch.int64 .* expected .* of shape \(K, 2\)"),
+    (
+        "odometry",
+        change(inlier_matches=lambda x: x.T),
+        r"odometry\.inlier_matches is torch.int64 .* expected .* of shape \(K, 2\)",
+    ),
     ("odometry", change(is_measured=torch.tensor), r"odometry\.is_measured is a Tensor, expected a bool"),
     (
         "free_space_check",
-        lambda result: result.appeared,
+        lambda result: result.was_free,
         "free_space_check returned a Tensor; it must return New",
     ),
     ("propose_unlabelled", lambda _: [], "propose_unlabelled returned a list; it must return Instances"),
@@ -120,9 +125,19 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
     ("odometry", change(T_cp=lambda T: T * torch.nan), r"^odometry\.T_cp has values that are not those of a rigid tr"),
     ("odometry", change(T_cp=lambda T: T * 2), r"^odometry\.T_cp has values that are not those of a rigid transform$"),
     ("odometry", change(T_cp=lambda T: MIRROR @ T), r"\.T_cp has values that are not those of a rigid transform$"),
+    ("odometry", change(matches=lambda x: x.T), r"odometry\.matches is torch.int64 .* shape \(M, 2\)"),
+    ("odometry", change(matches=lambda _: torch.tensor([[0, 9999]])), r"\.matches has values that are not indices of"),
     ("odometry", change(velocity=lambda x: x / 0), r"\.velocity has values that are not finite$"),
-    ("odometry", change(pairs=lambda _: torch.tensor([[0, 9999]])), r"\.pairs has values that are not indices of feat"),
-    ("odometry", change(pairs=lambda _: torch.tensor([[-1, 0]])), r"\.pairs has values that are not indices of featu"),
+    (
+        "odometry",
+        change(inlier_matches=lambda _: torch.tensor([[0, 9999]])),
+        r"\.inlier_matches has values that are not indices of feat",
+    ),
+    (
+        "odometry",
+        change(inlier_matches=lambda _: torch.tensor([[-1, 0]])),
+        r"\.inlier_matches has values that are not indices of featu",
+    ),
     (
         "describe_appearance",
         lambda x: x * 2,
@@ -157,9 +172,9 @@ def test_wrong_result_of_a_replaced_stage_is_named(stage: str, edit: Callable[[A
 def test_every_result_has_a_case() -> None:
     from v3d_torch.stages import stage_checks
 
-    checked = {name for name, result in stage_checks._RESULTS.items() if result is not None}
+    checked = {name for name, result in stage_checks.RESULTS.items() if result is not None}
     assert {stage for stage, _, _ in WRONG} == checked
-    assert set(stage_checks._RESULTS) <= vars(make_slam()).keys()
+    assert set(stage_checks.RESULTS) <= vars(make_slam()).keys()
 
 
 def test_replaced_stages_that_are_right_give_the_same_results() -> None:
@@ -229,7 +244,7 @@ def test_stage_that_cannot_be_called_is_rejected_at_once(name: str, stage: Any) 
     [
         (
             "classify_motion",
-            "^classify_motion was replaced by a stage without apply_corrections; derive it from MotionCla",
+            "^classify_motion was replaced by a stage without correct_result; derive it from MotionCla",
         ),
         ("free_space_check", "^free_space_check was replaced by a stage without make_view; derive it from FreeSpaceCh"),
         (
@@ -328,7 +343,7 @@ def configure(*overrides: str) -> Config:
 def test_configured_stages_are_checked_stages() -> None:
     from v3d_torch.stages import stage_checks
 
-    checked = {name for name, result in stage_checks._RESULTS.items() if result is not None}
+    checked = {name for name, result in stage_checks.RESULTS.items() if result is not None}
     assert StagesConfig.model_fields.keys() == checked - {"track_camera"} | {"segment"}
 
 

@@ -19,16 +19,16 @@ from v3d_torch.features.features import Features
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.depth_smoother import DepthSmoother
 from v3d_torch.mapping.keyframe import Keyframe
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.runtime.stage_hooks import HookedStage
 from v3d_torch.segmentation import UprightSegmenter
 from v3d_torch.slam import V3DSLAM
-from v3d_torch.stages.stage_checks import STAGES
+from v3d_torch.stages.replaceable_stages import STAGES
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, RGBDFrame
 
@@ -41,7 +41,7 @@ CALLS: dict[str, tuple[int, type | tuple[type, ...]]] = {
     "detect_features": (2, Features),
     "compensate": (5, Features),
     "odometry": (4, CameraMotion),
-    "free_space_check": (2, NewlyOccupied),
+    "free_space_check": (2, AppearedPixels),
     "propose_unlabelled": (3, Instances),
     "back_project_instances": (2, InstanceClouds),
     "describe_appearance": (2, torch.Tensor),

@@ -16,7 +16,7 @@ from v3d_torch.geometry.se3 import invert
 from v3d_torch.mapping.covisibility import count_shared_landmarks, covisibility_edges
 from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.odometry.motion_estimator import MotionEstimator
+from v3d_torch.odometry.motion_estimator import MotionEstimator, propagate_landmarks
 from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.tracking.map_tracker import MapTracker, MapTracking
 
@@ -61,8 +61,8 @@ class LoopCloser(StatefulComponent):
 
     Args:
         config: Configuration of loop closing.
-        motion: Estimator of the motion between two images from their features.
-        tracker: Tracker that refines a pose in a local map.
+        estimate_motion: Estimator of the motion between two images from their features.
+        track_map: Tracker that refines a pose in a local map.
         local_keyframes: Number of keyframes that form a local map.
 
     Attributes:
@@ -71,10 +71,12 @@ class LoopCloser(StatefulComponent):
 
     _STATE = ("loop_count",)
 
-    def __init__(self, config: LoopConfig, motion: MotionEstimator, tracker: MapTracker, local_keyframes: int) -> None:
+    def __init__(
+        self, config: LoopConfig, estimate_motion: MotionEstimator, track_map: MapTracker, local_keyframes: int
+    ) -> None:
         self._config = config
-        self._motion = motion
-        self._tracker = tracker
+        self._estimate_motion = estimate_motion
+        self._track_map = track_map
         self._local_keyframes = local_keyframes
         self._database = KeyframeDatabase()
         self.loop_count = 0
@@ -152,12 +154,12 @@ class LoopCloser(StatefulComponent):
         """Verify the candidates one after another, best first, and yield those that pass; see `relocalise`."""
         for index, _ in self._database.query(features.descriptors, self._config.candidates, exclude):
             keyframe = sparse_map.keyframes[index]
-            motion = self._motion(keyframe.features, features)
+            motion = self._estimate_motion(keyframe.features, features)
             if motion is None:
                 continue
             local = sparse_map.local_map(keyframe.observed_landmarks, self._local_keyframes)
-            propagated = motion.propagate_landmarks(keyframe.landmarks, len(features))
-            tracking = self._tracker(features, motion.T_ba @ keyframe.T_cw, local, propagated)
+            propagated = propagate_landmarks(motion.inlier_matches, keyframe.landmarks, len(features))
+            tracking = self._track_map(features, motion.T_ba @ keyframe.T_cw, local, propagated)
             if tracking is not None and tracking.count >= self._config.min_inliers:
                 yield PlaceMatch(keyframe, tracking)
 

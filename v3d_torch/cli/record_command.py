@@ -92,7 +92,7 @@ def record_static(
         recording, bar = StaticRecording(writer), TrackingBar(progress, total, interrupted, done=0)
 
         def on_frame(frame: RGBDFrame, result: FrameResult) -> None:
-            recording.add(frame, result.static_without_people)
+            recording.add(frame, result.map_mask)
             bar(frame, result)
 
         record = pipeline(on_frame)

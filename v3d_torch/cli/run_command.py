@@ -4,36 +4,28 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections import Counter
 from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from v3d_torch.batch.batch_folder import describe_contents
+from v3d_torch.cli.run_summary import print_summary, way_to_resume
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
-from v3d_torch.datasets.tum_extents import describe_difference
 from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError
-from v3d_torch.evaluation import Evaluation
-from v3d_torch.evaluation.evaluation import format_coverage, note_too_few_poses
-from v3d_torch.evaluation.outcome import label_sequence
-from v3d_torch.evaluation.paper_tables import make_paper_table
 from v3d_torch.io.files import check_writable
-from v3d_torch.mapping.map_io import load_map
-from v3d_torch.pipeline import Pipeline, Viewer, ViewerGroup
+from v3d_torch.mapping.map_io import StoredMap, load_map
+from v3d_torch.pipeline import Viewer, ViewerGroup
 from v3d_torch.runs.checkpoint import Checkpoint, describe_change, is_finished, read_checkpoint
 from v3d_torch.runs.console import run_with_progress
 from v3d_torch.runs.file_names import MAP_MASKS, MASKS, RunFile
 from v3d_torch.runs.map_file import check_map_path
 from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.print_line import print_line
-from v3d_torch.runs.profile_table import profile_table
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest, check_not_moved
 from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder, remove_empty_folder
@@ -42,6 +34,7 @@ from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
 from v3d_torch.segmentation import MaskFolder, make_segmenter
+from v3d_torch.types import Segmenter
 from v3d_torch.viz.viewer import make_viewer
 
 
@@ -171,16 +164,73 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
     _run(replace(request, **changed), folder, checkpoint, display)
 
 
+@dataclass(frozen=True)
+class _Inputs:
+    """Opened inputs of a run: frames, source of instances, and the map in which the camera is localised, if any."""
+
+    sequence: RGBDStream
+    segment: Segmenter
+    known_map: StoredMap | None
+
+
 def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, display: Display) -> None:
     """Open the inputs, run and print the summary."""
     console = Console(soft_wrap=True)
+    # Checked before the inputs are opened, and before a recording is created, which would remain.
+    replaces_results = _check_outputs(request, out, display, is_resumed=checkpoint is not None)
+    inputs = _open_inputs(request, checkpoint, console)
+    viewer = display.make_viewer(inputs.sequence)
+    is_new = out is None or not out.exists()
+    folder = make_result_folder(out, inputs.sequence.name)
+    if replaces_results:
+        print_line(console, f"note: {folder}: the results of an earlier run are replaced")
+    if checkpoint is not None:
+        total = len(inputs.sequence) if isinstance(inputs.sequence, Sized) else checkpoint.frames
+        print_line(console, f"resuming after {checkpoint.frames} of {total} frames")
+    try:
+        pipeline, evaluation = run_with_progress(
+            lambda: Run(request, **vars(inputs), folder=folder, viewer=viewer, checkpoint=checkpoint),
+            inputs.sequence,
+            folder,
+            console,
+            checkpoint,
+        )
+    except LockedError:  # the checkpoint in the folder is that of the other run
+        raise
+    except OutputError as error:
+        raise OutputError(f"{error}{way_to_resume(folder, inputs.sequence)}") from error
+    except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
+        if is_new:
+            remove_empty_folder(folder)
+        raise InputError(
+            f"{folder}: interrupted before the results were written{way_to_resume(folder, inputs.sequence)}"
+        ) from interrupt
+    print_summary(request, folder, pipeline, evaluation, console, profile=display.profile)
+
+
+def _check_outputs(request: RunRequest, out: Path | None, display: Display, *, is_resumed: bool) -> bool:
+    """Check that the files of a run can be written, and that they replace no files but those of an earlier run.
+
+    Returns:
+        True if a new run replaces the results of an earlier one.
+
+    Raises:
+        OutputError: If they cannot, or if another run writes to the folder.
+    """
     if request.save_map is not None:
         _check_map_path(Path(request.save_map), out, display)
-    masks = _path(request.masks)
-    replaces_results = False
-    if out is not None:  # checked before the inputs are opened, and before a recording is created, which would remain
-        check_unlocked(out)
-        replaces_results = _check_contents(out, masks, is_resumed=checkpoint is not None)
+    if out is None:
+        return False
+    check_unlocked(out)
+    return _check_contents(out, _path(request.masks), is_resumed=is_resumed)
+
+
+def _open_inputs(request: RunRequest, checkpoint: Checkpoint | None, console: Console) -> _Inputs:
+    """Open the inputs of a run, and check that those of a resumed run have not changed.
+
+    Raises:
+        InputError: If an input is not valid or has changed.
+    """
     if checkpoint is not None:
         check_not_moved(request, checkpoint.folder)
     sequence = _open_sequence(request, console)
@@ -195,41 +245,16 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
         known_map = load_map(Path(request.load_map), sequence.camera, request.config)
         if not known_map.map.active_keyframes:
             raise InputError(f"{request.load_map}: has no keyframes; give the map of a run that found the camera")
-    segment = make_segmenter(request.config, sequence.camera, weights=_path(request.weights), masks_dir=masks)
-    if isinstance(segment, MaskFolder) and checkpoint is None:
+    weights, masks = _path(request.weights), _path(request.masks)
+    segment = make_segmenter(request.config, sequence.camera, weights=weights, masks_dir=masks)
+    if checkpoint is not None:
+        _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
+    elif isinstance(segment, MaskFolder):
         if isinstance(sequence, Sized):
             segment.check_number(len(sequence))
         if isinstance(sequence, RGBDSequence) and not request.skip_broken:  # a broken frame needs no id image
             segment.check_stamps(sequence.stamps)
-    if checkpoint is not None:
-        _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
-    viewer = display.make_viewer(sequence)
-    is_new = out is None or not out.exists()
-    folder = make_result_folder(out, sequence.name)
-    if replaces_results:
-        print_line(console, f"note: {folder}: the results of an earlier run are replaced")
-    if checkpoint is not None:
-        total = len(sequence) if isinstance(sequence, Sized) else checkpoint.frames
-        print_line(console, f"resuming after {checkpoint.frames} of {total} frames")
-    try:
-        pipeline, evaluation = run_with_progress(
-            lambda: Run(request, sequence, segment, folder, viewer=viewer, known_map=known_map, checkpoint=checkpoint),
-            sequence,
-            folder,
-            console,
-            checkpoint,
-        )
-    except LockedError:  # the checkpoint in the folder is that of the other run
-        raise
-    except OutputError as error:
-        raise OutputError(f"{error}{_way_to_resume(folder, sequence)}") from error
-    except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
-        if is_new:
-            remove_empty_folder(folder)
-        raise InputError(
-            f"{folder}: interrupted before the results were written{_way_to_resume(folder, sequence)}"
-        ) from interrupt
-    _print_summary(request, display, folder, pipeline, evaluation, console)
+    return _Inputs(sequence, segment, known_map)
 
 
 def _check_segmentation(checkpoint: Checkpoint, files: SegmentationFiles) -> None:
@@ -296,91 +321,3 @@ def _open_sequence(request: RunRequest, console: Console) -> RGBDStream:
 
 def _path(text: str | None) -> Path | None:
     return None if text is None else Path(text)
-
-
-def _print_summary(
-    request: RunRequest,
-    display: Display,
-    folder: Path,
-    pipeline: Pipeline,
-    evaluation: Evaluation | None,
-    console: Console,
-) -> None:
-    """Print the result of a run.
-
-    Raises:
-        InputError: If the run ended early, or its results are incomplete.
-    """
-    record = pipeline.record
-    difference = describe_difference(pipeline.sequence)
-    console.print(_summary_table(request, pipeline, evaluation, difference))
-    if record.failure is not None and len(pipeline.slam.poses) + len(record.broken) < pipeline.frame_count:
-        difference = difference or f"part: {len(pipeline.slam.poses)} of {pipeline.frame_count} frames"
-    paper = None if evaluation is None else make_paper_table(pipeline.sequence.name, evaluation, difference)
-    if paper is not None:
-        console.print(paper)
-    if display.profile and record.times:
-        console.print(profile_table(record))
-    absent = note_too_few_poses(pipeline.sequence.groundtruth, len(pipeline.slam.poses))
-    for note in absent if evaluation is None else evaluation.notes:
-        print_line(console, f"note: {note}")
-    if record.save_error is not None:
-        print_line(console, f"note: no checkpoint was saved, {record.save_error}")
-    print_line(console, f"results: {folder}")
-    if record.failure is not None:
-        frames, fix = len(pipeline.slam.poses), _way_to_resume(folder, pipeline.sequence)
-        results = f"the results of the {frames} frames before are in {folder}{fix}"
-        raise InputError(f"{record.failure} ({results})")
-    if record.diagnosis is not None:
-        raise InputError(f"{record.diagnosis} (the results are in {folder})")
-
-
-def _way_to_resume(folder: Path, sequence: RGBDStream) -> str:
-    """Return the end of a message on a run that ended early: how to resume it.
-
-    It is empty if the run has no checkpoint, or that of a live stream, which contains no state.
-    """
-    can_resume = isinstance(sequence, RGBDSequence) and (folder / RunFile.CHECKPOINT).is_file()
-    return f"; resume with --resume {shlex.quote(str(folder))}" if can_resume else ""
-
-
-def _summary_table(
-    request: RunRequest, pipeline: Pipeline, evaluation: Evaluation | None, difference: str | None
-) -> Table:
-    slam, record = pipeline.slam, pipeline.record
-    statuses = Counter(slam.poses.statuses)
-    motion_states = record.dynamics.count_motion_states()
-    label = label_sequence(pipeline.sequence.name, difference)
-    table = Table(title=f"V3D-SLAM on {escape(label)}", show_header=False)
-    broken = f", {len(record.broken)} broken and skipped" if record.broken else ""
-    table.add_row("frames", f"{len(slam.poses)} of {pipeline.frame_count}{broken}")
-    table.add_row("poses", ", ".join(f"{count} {status.value}" for status, count in statuses.items()))
-    active = slam.map.active_keyframes
-    known = sum(keyframe.is_from_earlier_run for keyframe in active)
-    table.add_row("keyframes, loops", f"{len(active) - known}, {slam.loop_closer.loop_count}")
-    if request.load_map is not None:
-        table.add_row("loaded map", f"{known} {'keyframe' if known == 1 else 'keyframes'} left")
-    table.add_row("objects", str(record.dynamics.count_objects()))
-    if motion_states:
-        table.add_row("frames of objects", ", ".join(f"{count} {state}" for state, count in motion_states.items()))
-    for title, name in (("latency of poses", "pose_latency"), ("latency of results", "latency")):
-        if (latency := record.live.statistics(name)) is not None:
-            table.add_row(title, f"median {1e3 * latency['median']:.0f} ms, 95% below {1e3 * latency['p95']:.0f} ms")
-    if len(record.live):
-        rejected = f", {record.rejected} late or out of order" if record.rejected else ""
-        table.add_row("dropped", f"{record.live.dropped} of {pipeline.frame_count} frames{rejected}")
-    table.add_row("frames per second", f"{len(slam.poses) / record.seconds:.1f}" if record.seconds else "-")
-    if evaluation is not None:
-        coverage = "" if evaluation.coverage is None else f" (coverage {format_coverage(evaluation.coverage)})"
-        table.add_row("ATE rmse", f"{evaluation.ate.rmse:.4f} m{coverage}")
-        if evaluation.pairs < evaluation.poses:
-            table.add_row("scored", evaluation.pairs_text)
-        if evaluation.rpe is not None:
-            table.add_row("RPE rmse", f"{evaluation.rpe.trans.rmse:.4f} m/s, {evaluation.rpe.rot.rmse:.3f} deg/s")
-    if (masks := record.mask_evaluation.compute_scores()) is not None:
-        fractions = {"moving": masks.moving_masked, "static": masks.static_masked}
-        texts = [f"{value:.1%} of the {name} pixels" for name, value in fractions.items() if value is not None]
-        table.add_row("masked", ", ".join(texts))
-        if (id_switches := masks.id_switches_per_60_frames) is not None:
-            table.add_row("id switches", f"{id_switches:.1f} per 60 frames ({masks.people_found:.0%} found)")
-    return table

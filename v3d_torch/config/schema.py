@@ -141,9 +141,9 @@ class FreeSpaceConfig(Section):
     max_depth: float = Field(6.0, gt=0)
     """Maximum depth of points that are checked, metres: beyond, two standard deviations of the depth are as large as
     the motion to detect."""
-    tolerance: float = Field(0.01, gt=0)
-    """Depth tolerance divided by the squared depth, 1/m: seven standard deviations of the depth of a structured-light
-    camera."""
+    inverse_depth_tolerance: float = Field(0.01, gt=0)
+    """Tolerance of the inverse depth, 1/m: seven standard deviations of that of a structured-light camera. The
+    tolerance of depth increases with its square."""
     min_tolerance: float = Field(0.04, ge=0.001)
     """Minimum depth tolerance, metres: the thickness of clothes and of a voxel."""
     depth_sync_error: float = Field(0.015, ge=0, le=1)
@@ -418,9 +418,9 @@ class OccupancyConfig(Section):
     voxel."""
     max_depth: float = Field(4.0, gt=0, le=10)
     """Maximum depth of obstacles, metres, as for the dense map; farther rays show free space up to it."""
-    depth_tolerance: float = Field(0.006, ge=0)
-    """Depth tolerance divided by the squared depth, 1/m: four standard deviations of the depth of a structured-light
-    camera (Khoshelham and Elberink, Sensors 2012). Space within the tolerance of a surface is not observed as free."""
+    inverse_depth_tolerance: float = Field(0.006, ge=0)
+    """Tolerance of the inverse depth, 1/m: four standard deviations of that of a structured-light camera (Khoshelham
+    and Elberink, Sensors 2012). Space within the tolerance of a surface is not observed as free."""
     hit_probability: float = Field(0.7, gt=0.5, lt=1)
     """Probability that a voxel that contains a depth measurement is occupied (OctoMap)."""
     miss_probability: float = Field(0.4, gt=0, lt=0.5)

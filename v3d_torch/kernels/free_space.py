@@ -83,7 +83,7 @@ def _transform_row(
     "(f4[:,::1], i8, f8[:,::1], f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4),"
     " f8[:,::1])"
 )
-def newly_occupied(
+def was_free(
     depth: Floats32, stride: int, rays: Floats, T_wc: Floats, T_cw: Floats, nearest_depth: Floats32,
     intrinsics: Intrinsics, bounds: Bounds, limits: Limits, appeared: Floats,
 ) -> None:  # fmt: skip

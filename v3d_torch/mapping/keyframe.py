@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from v3d_torch.features.features import Features
+from v3d_torch.types import LandmarkObserver
 
 
 @dataclass
-class Keyframe:
+class Keyframe(LandmarkObserver):
     """A frame that is stored in the map.
 
     Attributes:
@@ -55,11 +56,6 @@ class Keyframe:
     def is_from_earlier_run(self) -> bool:
         """True if the keyframe was created by an earlier run."""
         return self.frame < 0
-
-    @property
-    def observed_landmarks(self) -> Tensor:
-        """Ids of the observed landmarks, int64, shape :math:`(L,)`."""
-        return self.landmarks[self.landmarks >= 0]
 
 
 def stack_poses(keyframes: Sequence[Keyframe]) -> Tensor:

@@ -82,13 +82,13 @@ def local_bundle_adjust(
     selected = select_observations(sparse_map, window, config, with_neighbours=True)
     if len(window) < 2 or len(selected) == 0:
         return None
-    poses, landmarks, T_cw = selected.keyframes, selected.landmarks, sparse_map.T_cw
-    fixed = ~torch.isin(poses, window) | (poses == 0)
+    keyframes, landmarks, T_cw = selected.keyframes, selected.landmarks, sparse_map.T_cw
+    fixed = ~torch.isin(keyframes, window) | (keyframes == 0)
     if not fixed.any():
         fixed[0] = True  # fix the gauge by the oldest keyframe
     observations = selected.arguments(camera.K, fixed)
     result = bundle_adjust(
-        T_cw[poses],
+        T_cw[keyframes],
         sparse_map.landmarks["point"][landmarks],
         **observations,
         iterations=_MAX_ITERATIONS,
@@ -106,7 +106,7 @@ def local_bundle_adjust(
             **observations,
         )
         readout = Readout(*map(float, estimate))
-    T_cw[poses[~fixed]] = orthonormalise(result.T_cw[~fixed])
+    T_cw[keyframes[~fixed]] = orthonormalise(result.T_cw[~fixed])
     return LocalAdjustment(T_cw, landmarks, result.points, selected.rows[~result.inliers], readout)
 
 

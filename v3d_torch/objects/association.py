@@ -1,8 +1,8 @@
 """Association evidence: likelihood of an instance if it continues a track, relative to that of a new object.
 
 Each kind of evidence is a log-likelihood ratio, as in multiple hypothesis tracking (Blackman, 2004): position, overlap
-of the masks, appearance, class and vacancy. Their sum for a pair is positive if the instance more likely continues the
-track than is a new object.
+of the masks, appearance, class and vacated places. Their sum for a pair is positive if the instance more likely
+continues the track than is a new object.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _MIN_APPEARANCE = -3.0
 _CLASS_CHANGE = -2.0
 """Evidence of a different class; it is small, because the class of an object can change between frames."""
 
-_VACANCY_RATE, _MAX_VACANCY = 30.0, 6.0
+_VACATED_RATE, _MAX_VACATED = 30.0, 6.0
 """Evidence against a track per second for which its predicted place was observed to be empty, and its upper bound."""
 
 _RADIUS = 0.3
@@ -129,7 +129,7 @@ def class_log_ratio(same_class: Tensor) -> Tensor:
     return torch.where(same_class, 0.0, _CLASS_CHANGE).to(torch.float64)
 
 
-def vacancy_log_ratio(seconds: float, variance: float) -> float:
+def vacated_log_ratio(seconds: float, variance: float) -> float:
     """Log-likelihood ratio of a track whose predicted place is observed to be empty.
 
     Args:
@@ -138,4 +138,4 @@ def vacancy_log_ratio(seconds: float, variance: float) -> float:
     """
     # The place is empty as well if the object has moved by more than its radius. The probability of this, for a normal
     # distribution in two dimensions, limits the evidence, however long the place has been empty.
-    return -min(_VACANCY_RATE * seconds, _MAX_VACANCY, _RADIUS**2 / (2 * variance))
+    return -min(_VACATED_RATE * seconds, _MAX_VACATED, _RADIUS**2 / (2 * variance))

@@ -37,12 +37,12 @@ class FeatureSupport:
         inliers: Mask of the features that are matched to the previous frame and fit the camera motion, bool, shape
             :math:`(N,)`.
         residuals: Displacement of each feature against the camera motion, pixels, float64, shape :math:`(N, 2)`; NaN
-            for features without a match. None if displacements are not measured.
+            for features without a match.
     """
 
     pixel: Tensor
     inliers: Tensor
-    residuals: Tensor | None = None
+    residuals: Tensor
 
     def on_objects(self, masks: Sequence[Tensor]) -> Tensor:
         """Find the features on each object.
@@ -96,6 +96,4 @@ class FeatureSupport:
             on_objects: Features of each of K objects, see `on_objects`.
             size: Height and width of the image, pixels.
         """
-        if self.residuals is None:
-            return [None] * len(on_objects)
         return feature_shifts(self.pixel, self.residuals, on_objects, size)

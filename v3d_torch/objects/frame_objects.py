@@ -17,7 +17,8 @@ class MotionState(StrEnum):
     """Motion state of an object."""
 
     STATIC = "static"
-    """At rest: its pixels are tracked and, unless it is a person, mapped."""
+    """At rest: tracking, landmarks and the occupancy map use its pixels. Point map and mesh use them unless it is a
+    person."""
     DYNAMIC = "dynamic"
     """It moved recently: most of it is where an earlier view saw free space, or most of its former place is free now
     and enough objects vote for it, or its features moved against the camera motion."""
@@ -80,7 +81,7 @@ class FrameObjects:
     Attributes:
         objects: Objects, sorted by id.
         static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
-        static_without_people: Pixels of ``static_mask`` at a larger distance from moving objects and from people, even
+        map_mask: Pixels of ``static_mask`` at a larger distance from moving objects and from people, even
             static ones: for what is stored, such as point map, recordings and static surfaces; bool, shape
             :math:`(H, W)`.
         vote_pairs: Votes that counted over any time span: id of the voting object and id of the object voted for,
@@ -89,11 +90,11 @@ class FrameObjects:
 
     objects: list[TrackedObject]
     static_mask: Tensor
-    static_without_people: Tensor
+    map_mask: Tensor
     vote_pairs: list[tuple[int, int]]
 
     @classmethod
-    def none(cls, height: int, width: int) -> FrameObjects:
+    def empty(cls, height: int, width: int) -> FrameObjects:
         """Return the result for a frame in which everything is static."""
         everywhere = torch.ones(height, width, dtype=torch.bool)
         return cls([], everywhere, everywhere, [])

@@ -1,4 +1,4 @@
-"""Free-space check: points that newly occupy free space, and places that objects have vacated.
+"""Free-space check: points that appeared in free space, and places that objects have vacated.
 
 The paper's votes and Chamfer distances compare centroids and clouds. Both also change when an object is cut by the
 image border, occluded, or segmented differently. The camera motion over the static background is known from hundreds
@@ -21,9 +21,9 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
 from v3d_torch.kernels import free_space as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.depth_view import DepthView, SpaceView, StoredView
 from v3d_torch.objects.image_scale import coarse_stride
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.stored_views import StoredViews
 from v3d_torch.types import MIN_INTERVAL, STAMP_TOLERANCE
 
@@ -33,7 +33,7 @@ is at least as old as the time span can be one frame interval older."""
 
 
 def _limits(config: FreeSpaceConfig) -> kernels.Limits:
-    return config.min_depth, config.max_depth, config.tolerance, config.min_tolerance
+    return config.min_depth, config.max_depth, config.inverse_depth_tolerance, config.min_tolerance
 
 
 def _observe_compiled(points: Tensor, view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig) -> Tensor:
@@ -66,12 +66,12 @@ def observe_free_space(points: Tensor, view: SpaceView, camera: PinholeCamera, c
     u, v = pixels.round().to(torch.int64).unbind(dim=1)
     index = torch.where(inside, v * camera.width + u, 0)
     measured = torch.where(inside, view.nearest_depth.flatten().index_select(0, index), 0.0).to(torch.float64)
-    tolerance = (config.tolerance * expected.square()).clamp(min=config.min_tolerance)
+    tolerance = (config.inverse_depth_tolerance * expected.square()).clamp(min=config.min_tolerance)
     visible = (measured > 0) & (measured > expected - tolerance)
     return torch.where(visible, (measured > expected + tolerance).to(torch.float64), torch.nan)
 
 
-def _newly_occupied_compiled(
+def _was_free_compiled(
     view: DepthView,
     earlier: Sequence[SpaceView | None],
     rays: Tensor,
@@ -80,17 +80,17 @@ def _newly_occupied_compiled(
     config: FreeSpaceConfig,
 ) -> Tensor:
     depth, T_wd, directions = to_array(view.depth[0]), to_array(invert(view.T_dw)), to_array(rays)
-    appeared = np.full((len(earlier), -(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), np.nan)
-    for row, previous in zip(appeared, earlier, strict=True):
+    was_free = np.full((len(earlier), -(-depth.shape[0] // stride), -(-depth.shape[1] // stride)), np.nan)
+    for row, previous in zip(was_free, earlier, strict=True):
         if previous is not None:
             pose, nearest_depth = to_array(previous.T_dw), to_array(previous.nearest_depth)
             observer = pose, nearest_depth, camera.intrinsics, camera.bounds, _limits(config)
-            kernels.newly_occupied(depth, stride, directions, T_wd, *observer, row)
-    return torch.from_numpy(appeared)
+            kernels.was_free(depth, stride, directions, T_wd, *observer, row)
+    return torch.from_numpy(was_free)
 
 
-@compiled_by(_newly_occupied_compiled)
-def _newly_occupied(
+@compiled_by(_was_free_compiled)
+def _was_free(
     view: DepthView,
     earlier: Sequence[SpaceView | None],
     rays: Tensor,
@@ -112,15 +112,15 @@ def _newly_occupied(
         1 if the space was free, 0 if it was occupied, NaN if unknown; float64, shape (B, h, w).
     """
     z = view.depth[0, ::stride, ::stride].to(torch.float64)
-    appeared = torch.full((len(earlier), *z.shape), torch.nan, dtype=torch.float64)
+    was_free = torch.full((len(earlier), *z.shape), torch.nan, dtype=torch.float64)
     measured = torch.nonzero(((z > config.min_depth) & (z <= config.max_depth)).flatten())[:, 0]
     T_wd = invert(view.T_dw)
     in_camera = rays.index_select(1, measured) * z.flatten().index_select(0, measured)
     points = (T_wd[:3, :3] @ in_camera + T_wd[:3, 3:]).T
-    for row, previous in zip(appeared.flatten(1), earlier, strict=True):
+    for row, previous in zip(was_free.flatten(1), earlier, strict=True):
         if previous is not None:
             row[measured] = observe_free_space(points, previous, camera, config)
-    return appeared
+    return was_free
 
 
 def vacated_fractions(
@@ -150,7 +150,7 @@ def vacated_fractions(
 
 
 class FreeSpaceCheck(StoredViews):
-    """Comparison of each view with earlier views: pixels that newly occupy free space.
+    """Comparison of each view with earlier views: pixels that appeared in free space.
 
     Args:
         config: Time spans and tolerances.
@@ -181,7 +181,7 @@ class FreeSpaceCheck(StoredViews):
         misalignment = round(self._camera.fx * rotation_rate * self._config.depth_sync_error)
         return DepthView(stamp, depth, T_dw, misalignment, is_motion_measured)
 
-    def __call__(self, view: DepthView, *, pose_known: bool = True) -> NewlyOccupied:
+    def __call__(self, view: DepthView, *, pose_known: bool = True) -> AppearedPixels:
         """Compare a view with the stored views.
 
         Args:
@@ -190,13 +190,13 @@ class FreeSpaceCheck(StoredViews):
                 everything would seem to appear; then nothing is compared.
 
         Returns:
-            Newly occupied pixels, one row per time span; no row if nothing is compared.
+            Pixels that appeared, one row per time span; no row if nothing is compared.
         """
         config = self._config
         time_spans = config.time_spans if config.enabled and pose_known else ()
         earlier = [self._newest_view_before(view.stamp - time_span) for time_span in time_spans]
-        appeared = _newly_occupied(view, earlier, self._rays, self._stride, self._camera, config)
-        return NewlyOccupied(appeared, self._stride)
+        was_free = _was_free(view, earlier, self._rays, self._stride, self._camera, config)
+        return AppearedPixels(was_free, self._stride)
 
     def add_view(self, view: DepthView, T_dw: Tensor) -> None:
         """Store a view with its final pose, and drop the views that are too old for all time spans.

@@ -35,8 +35,11 @@ fraction of the smaller mask: the network finds a person and also a part of this
 _DUPLICATE_DISTANCE = 0.5
 """Maximum distance of the centroids of two detections of an object, metres."""
 
-_MIN_FREE_FRACTION = 0.5
-"""The predicted place of a missed object is empty if the camera sees through more than this fraction of its points."""
+_MIN_VACATED_FRACTION = 0.5
+"""A missed object has vacated its predicted place if the depth is behind more than this fraction of its points."""
+
+_MIN_COVERED_FRACTION = 0.4
+"""A missed object is behind a detected one whose surface covers more than this fraction of its predicted mask."""
 
 _MAX_SHOWN_TIME = 0.1
 """A missed object is shown for this long, seconds: an object that is missed for longer is mostly hidden or has
@@ -49,7 +52,7 @@ _MAX_OBSERVED_TIME = 0.2
 class InstanceTracker(torch.nn.Module):
     """Assignment of object ids to the instances of each frame.
 
-    The instances of a frame continue tracks in four stages, each an optimal assignment. Instances with a class continue
+    The instances of a frame continue tracks in four passes, each an optimal assignment. Instances with a class continue
     confirmed, resting and lost tracks with a class, then all other tracks. Instances without a class continue tracks
     without a class, then those with one. An instance that was propagated continues its own track.
 
@@ -64,8 +67,9 @@ class InstanceTracker(torch.nn.Module):
         clouds: Spacing and maximum depth of the points of the clouds.
 
     Attributes:
-        tracks: Tracks that were detected in the newest frame, or may move and were missed for at most the maximum time.
-        resting: Tracks that cannot move by themselves and were missed for at most the maximum time.
+        tracks: Tracks that were detected in the newest frame, or may move, are not covered by a detected object of
+            their class and were missed for at most the maximum time.
+        resting: Missed tracks of furniture that was never observed to move, for at most the maximum time.
         lost: Confirmed tracks that were missed for longer, or whose place another object occupies.
         last_stamp: Timestamp of the last frame, seconds; -infinity before the first one.
         comparable_since: Time of the first detection that can be compared with the newest ones, seconds: before it, a
@@ -84,7 +88,7 @@ class InstanceTracker(torch.nn.Module):
         self.resting: list[Track] = []
         self.lost: list[Track] = []
         self.comparable_since = -torch.inf
-        self._unregistered_since: float | None = None  # the world frame of the detections since then is a guess
+        self._guessed_since: float | None = None  # the world frame of the detections since then is a guess
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return the tracks and the next id, for ``state_dict()``.
@@ -98,7 +102,7 @@ class InstanceTracker(torch.nn.Module):
             "next_id": self._next_id,
             "last_stamp": self.last_stamp,
             "comparable_since": self.comparable_since,
-            "unregistered_since": self._unregistered_since,
+            "guessed_since": self._guessed_since,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -110,7 +114,7 @@ class InstanceTracker(torch.nn.Module):
         self.tracks, self.resting = list(state["tracks"]), list(state["resting"])
         self.lost = list(state["lost"])
         self._next_id, self.last_stamp = state["next_id"], state["last_stamp"]
-        self.comparable_since, self._unregistered_since = state["comparable_since"], state["unregistered_since"]
+        self.comparable_since, self._guessed_since = state["comparable_since"], state["guessed_since"]
 
     def forward(
         self,
@@ -132,7 +136,7 @@ class InstanceTracker(torch.nn.Module):
             appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
         Returns:
-            Tracks that were detected, or may move and were missed for at most the maximum time, sorted by id.
+            ``tracks``, sorted by id.
         """
         camera, stride = self._camera, self._stride
         compared = appearance if self._config.compare_appearance else None
@@ -171,11 +175,11 @@ class InstanceTracker(torch.nn.Module):
         for track in (*self.tracks, *self.resting, *self.lost):
             track.apply_world_correction(T_new_old)
 
-    def start_unregistered(self, stamp: float) -> None:
+    def start_guessed_world(self, stamp: float) -> None:
         """Record that the motion of the camera before a frame was not measured.
 
         Detections from now on are not compared with earlier ones, and their world frame is not that of the map until
-        `register`. Before the first frame there are no detections to compare.
+        `move_to_map`. Before the first frame there are no detections to compare.
 
         Args:
             stamp: Timestamp of the frame, seconds.
@@ -183,11 +187,11 @@ class InstanceTracker(torch.nn.Module):
         if self.last_stamp == -torch.inf:
             return
         self.comparable_since = stamp
-        if self._unregistered_since is None:
-            self._unregistered_since = stamp
+        if self._guessed_since is None:
+            self._guessed_since = stamp
 
-    def register(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
-        """Transform the detections since the first `start_unregistered` into the world frame of the map.
+    def move_to_map(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
+        """Transform the detections since the first `start_guessed_world` into the world frame of the map.
 
         Args:
             T_new_old: Transform from the world frame of these detections to that of the map, float64, shape
@@ -196,10 +200,10 @@ class InstanceTracker(torch.nn.Module):
         """
         if all_tracks:
             self.apply_world_correction(T_new_old)
-        elif self._unregistered_since is not None:
+        elif self._guessed_since is not None:
             for track in (*self.tracks, *self.resting, *self.lost):
-                track.apply_world_correction(T_new_old, self._unregistered_since)
-        self._unregistered_since = None
+                track.apply_world_correction(T_new_old, self._guessed_since)
+        self._guessed_since = None
 
     def _continued_tracks(self, instances: Instances) -> dict[int, Track]:
         """Return the track of each instance of which it is known, by its index."""
@@ -211,7 +215,7 @@ class InstanceTracker(torch.nn.Module):
     def _match(
         self, predicted: PredictedTracks, detected: DetectedInstances, matched: Collection[int]
     ) -> dict[int, Track]:
-        """Match instances to tracks in stages.
+        """Match instances to tracks in four passes.
 
         Args:
             predicted: Tracks to match.
@@ -232,9 +236,9 @@ class InstanceTracker(torch.nn.Module):
                 compare_without_masks(without_masks, detected, self._config),
             ]
         )
-        labelled = detected.labels != UNLABELLED
-        named = torch.tensor([track.label != UNLABELLED for track in tracks], dtype=torch.bool)
-        established = torch.tensor([track.is_confirmed or track in self.resting for track in tracks], dtype=torch.bool)
+        instance_has_class = detected.labels != UNLABELLED
+        track_has_class = torch.tensor([track.label != UNLABELLED for track in tracks], dtype=torch.bool)
+        first_choice = torch.tensor([track.is_confirmed or track in self.resting for track in tracks], dtype=torch.bool)
         free_instances = torch.tensor([j not in matched for j in range(len(detected))])
         free_tracks = torch.ones(len(tracks), dtype=torch.bool)
         matches: dict[int, Track] = {}
@@ -244,10 +248,10 @@ class InstanceTracker(torch.nn.Module):
                 matches[j] = tracks[i]
                 free_tracks[i], free_instances[j] = False, False
 
-        assign(named & established, labelled)
-        assign(~(named & established), labelled)
-        assign(~named, ~labelled)
-        assign(named, ~labelled)
+        assign(track_has_class & first_choice, instance_has_class)
+        assign(~(track_has_class & first_choice), instance_has_class)
+        assign(~track_has_class, ~instance_has_class)
+        assign(track_has_class, ~instance_has_class)
         self._restart_tracks(matches.values(), detected.stamp)
         return matches
 
@@ -293,9 +297,9 @@ class InstanceTracker(torch.nn.Module):
                 track.drop_masks()
                 resting.append(track)
                 continue
-            seen_through = predicted.silhouettes[i].count_seen_through(depth)
-            if seen_through > _MIN_FREE_FRACTION * len(track.newest.cloud):
-                track.add_vacancy(stamp, min(stamp - self.last_stamp, _MAX_OBSERVED_TIME))
+            vacated = predicted.silhouettes[i].count_vacated(depth)
+            if vacated > _MIN_VACATED_FRACTION * len(track.newest.cloud):
+                track.add_vacated_time(stamp, min(stamp - self.last_stamp, _MAX_OBSERVED_TIME))
             if stamp - track.newest.stamp > self._config.max_missed_time or is_covered:
                 lost.append(track)
                 continue
@@ -335,7 +339,7 @@ class InstanceTracker(torch.nn.Module):
             return [False] * len(tracks)
         surfaces = torch.stack([pack_masks(other.cloud_pixels, self._stride) for other in with_centroid])
         common = count_common_pixels(coarse_masks, surfaces)
-        is_over = common > self._config.min_overlap * count_pixels(coarse_masks)[:, None]
+        is_over = common > _MIN_COVERED_FRACTION * count_pixels(coarse_masks)[:, None]
         same_class = torch.tensor([[track.label == other.label for other in with_centroid] for track in tracks])
         covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
         return covered

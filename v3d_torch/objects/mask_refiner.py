@@ -24,10 +24,10 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.crops import Crop, crop_around
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.dilation import dilate, ellipse
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.objects.resampling import upsample_nearest
 from v3d_torch.objects.silhouette import CELL_SIZE, silhouettes
 from v3d_torch.objects.static_surfaces import StaticSurfaces
@@ -35,9 +35,8 @@ from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixe
 from v3d_torch.objects.track import Track, predict_clouds
 from v3d_torch.segmentation.coco import PERSON
 
-_TOLERANCE_GROWTH = 0.01
-"""Growth of the depth tolerance with the square of depth, 1/m: seven times the standard deviation of the
-depth of a structured-light camera."""
+_INVERSE_DEPTH_TOLERANCE = 0.01
+"""Tolerance of the inverse depth, 1/m: seven times the standard deviation of that of a structured-light camera."""
 
 _MIN_PART_RADIUS = 8
 """Minimum radius of a part of the network's mask that is kept beside the object's surface, pixels."""
@@ -49,8 +48,8 @@ class RefinedMask(NamedTuple):
     Attributes:
         crop: Rows and columns of the part; none if the mask is empty.
         surface: Pixels of the object there, bool, shape :math:`(h, w)`.
-        mask: The pixels of ``surface``, and other parts of the network's mask: parts that were not there before, and
-            parts that belonged to the object at its last detection, bool, shape :math:`(h, w)`.
+        mask: The pixels of ``surface``, and other parts of the network's mask: parts that are not known to have been
+            there before, and parts that belonged to the object at its previous detection, bool, shape :math:`(h, w)`.
     """
 
     crop: Crop
@@ -64,7 +63,7 @@ class MaskRefiner:
     Args:
         tracks: Tracks of the objects.
         view: Depth and pose of the frame.
-        newly_occupied: Newly occupied pixels of the frame.
+        appeared_pixels: Pixels of the frame that appeared.
         static_surfaces: Static surfaces of earlier views.
         config: Margins and tolerances of the masks, and the spacing of the clouds.
         camera: Camera of the frame.
@@ -74,7 +73,7 @@ class MaskRefiner:
         self,
         tracks: Sequence[Track],
         view: DepthView,
-        newly_occupied: NewlyOccupied,
+        appeared_pixels: AppearedPixels,
         static_surfaces: StaticSurfaces,
         config: ObjectsConfig,
         camera: PinholeCamera,
@@ -84,9 +83,9 @@ class MaskRefiner:
         self._config = config.static_mask
         self._camera = camera
         self._spacing = config.clouds.voxel_size
-        self._newly_occupied = newly_occupied
+        self._appeared_pixels = appeared_pixels
         self._static_surfaces = static_surfaces
-        self._stride = newly_occupied.stride
+        self._stride = appeared_pixels.stride
         self._step = math.lcm(self._stride, CELL_SIZE)
         # Maximum distance of a refined mask from the network's; surfaces are grown and filled in steps of the stride.
         self._reach = max(self._config.surface_margin, self._config.depth_margin) + 2 * self._stride
@@ -102,20 +101,20 @@ class MaskRefiner:
         return find_concave_edges(self._view.depth[0].numpy()[:: self._stride, :: self._stride])
 
     @cached_property
-    def _previously_occupied(self) -> NDArray[np.bool_]:
+    def _was_occupied(self) -> NDArray[np.bool_]:
         """Every n-th pixel whose surface was there before."""
-        return self._newly_occupied.previously_occupied.numpy()
+        return self._appeared_pixels.was_occupied.numpy()
 
     @cached_property
-    def _new_surface(self) -> NDArray[np.bool_]:
-        """Every n-th pixel with depth whose surface was not there before."""
-        return ~(self._previously_occupied | self._view.missing.numpy()[:: self._stride, :: self._stride])
+    def _possibly_new(self) -> NDArray[np.bool_]:
+        """Every n-th pixel with depth whose surface is not known to have been there before."""
+        return ~(self._was_occupied | self._view.missing.numpy()[:: self._stride, :: self._stride])
 
     @cached_property
     def _continuous(self) -> NDArray[np.bool_]:
-        """Every n-th pixel without an edge whose surface was not there before."""
+        """Every n-th pixel without an edge whose surface is not known to have been there before."""
         smooth = find_smooth_pixels(self._view.depth[0].numpy(), self._stride, self._config.edge_ratio)
-        return smooth & ~(self._concave | self._previously_occupied)
+        return smooth & ~(self._concave | self._was_occupied)
 
     @cached_property
     def _static_surface(self) -> NDArray[np.bool_]:
@@ -123,11 +122,11 @@ class MaskRefiner:
         masks = np.zeros(self._concave.shape, np.bool_)
         for track in self._people:
             masks |= track.mask.numpy()[:: self._stride, :: self._stride]
-        if not len(self._newly_occupied.appeared):  # the pose relative to earlier views is not known
+        if not len(self._appeared_pixels.was_free):  # the pose relative to earlier views is not known
             return np.zeros_like(masks)
         reachable = _dilate(masks, self._reach // self._stride) & self._continuous
         reachable |= _dilate(masks, self._config.depth_margin // self._stride + 1)
-        reachable &= ~(masks | self._newly_occupied.is_new.numpy())
+        reachable &= ~(masks | self._appeared_pixels.appeared.numpy())
         return self._static_surfaces.find(self._view, torch.from_numpy(reachable), self._stride).numpy()
 
     def refine(self, track: Track) -> RefinedMask:
@@ -170,29 +169,29 @@ class MaskRefiner:
 
     def _tolerance(self, track: Track) -> float:
         """Return the maximum depth difference between a pixel and the points of an object around it, metres."""
-        return self._config.depth_tolerance + _TOLERANCE_GROWTH * self._silhouettes[track][1] ** 2
+        return self._config.depth_tolerance + _INVERSE_DEPTH_TOLERANCE * self._silhouettes[track][1] ** 2
 
     def _with_other_parts(self, track: Track, surface: NDArray[np.bool_], crop: Crop) -> NDArray[np.bool_]:
         """Return an object's pixels and other parts of the network's mask, bool, shape (h, w).
 
-        New parts are kept, because they can be a second person: a network sometimes draws one mask over two people.
-        Parts that belonged to the object at its last detection are kept, because its points can be those of an arm far
-        in front of the body, without the body.
+        Parts that are not known to have been there before are kept, because they can be a second person: a network
+        sometimes draws one mask over two people. Parts that belonged to the object at its previous detection are kept,
+        because its points can be those of an arm far in front of the body, without the body.
         """
         stride, segmented = self._stride, track.mask.numpy()[crop]
         parts = _wide_parts(segmented[::stride, ::stride] & ~surface[::stride, ::stride], stride)
         if parts.any():  # seldom; the rest takes longer
-            parts &= self._new_surface[self._cells(crop)] | self._earlier_surface(track, crop)
+            parts &= self._possibly_new[self._cells(crop)] | self._previous_surface(track, crop)
             parts = _wide_parts(parts, stride)
         if not parts.any():
             return surface
         pixels = upsample_nearest(parts, stride, surface.shape).numpy()
         return surface | (pixels & segmented & ~self._view.missing.numpy()[crop])
 
-    def _earlier_surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
-        """Return every n-th pixel of a part of the image that shows the points of the last detection of an object."""
+    def _previous_surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
+        """Return every n-th pixel of a part of the image that shows the points of an object's previous detection."""
         depth = self._view.depth[:, *crop][:, :: self._stride, :: self._stride]
-        cloud = track.earlier_cloud()
+        cloud = track.predict_previous_cloud()
         if cloud is None:
             return np.zeros(depth.shape[1:], np.bool_)
         silhouette = silhouettes([transform_points(self._view.T_dw, cloud)], self._camera, self._spacing)[0]

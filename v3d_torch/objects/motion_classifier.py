@@ -13,6 +13,7 @@ from torch import Tensor
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.feature_support import FeatureSupport
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
@@ -28,14 +29,13 @@ from v3d_torch.objects.motion_evidence import (
     free_space_evidence,
     hough_vote_evidence,
 )
-from v3d_torch.objects.newly_occupied import NewlyOccupied
+from v3d_torch.objects.result_masks import result_masks
 from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.surface_centroids import SurfaceCentroids
 from v3d_torch.objects.track import Track
-from v3d_torch.objects.visible_masks import visible_masks
 from v3d_torch.runtime.stateful import StatefulComponent
-from v3d_torch.segmentation.coco import LIVING, PERSON, RIGID
+from v3d_torch.segmentation.coco import LIVING, PERSON
 from v3d_torch.types import STAMP_TOLERANCE, Instances
 
 _STATIC_FRACTION = 0.1
@@ -73,7 +73,7 @@ class MotionClassifier(StatefulComponent):
         instances: Instances,
         clouds: InstanceClouds,
         view: DepthView,
-        newly_occupied: NewlyOccupied,
+        appeared_pixels: AppearedPixels,
         feature_support: FeatureSupport,
         appearance: Tensor | None = None,
     ) -> FrameObjects:
@@ -83,7 +83,7 @@ class MotionClassifier(StatefulComponent):
             instances: Instances of the frame.
             clouds: Clouds of the instances, camera frame.
             view: Depth of the frame, with the pose from frame-to-frame motion.
-            newly_occupied: Newly occupied pixels of the frame, see `FreeSpaceCheck`.
+            appeared_pixels: Pixels of the frame that appeared, see `FreeSpaceCheck`.
             feature_support: Features of the frame and their agreement with the camera motion.
             appearance: Colour histograms of the instances, float32, shape :math:`(N, D)`; None if unknown.
 
@@ -93,23 +93,23 @@ class MotionClassifier(StatefulComponent):
         stamp, previous_stamp = view.stamp, self._tracker.last_stamp
         # Ids; missed objects are predicted (Sec. II, III-C).
         if not view.is_motion_measured:
-            self._tracker.start_unregistered(stamp)
+            self._tracker.start_guessed_world(stamp)
         tracks = self._tracker(stamp, instances, clouds, view.depth, invert(view.T_dw), appearance)
-        evidence = self._collect_evidence(tracks, previous_stamp, view, newly_occupied, feature_support)
+        evidence = self._collect_evidence(tracks, previous_stamp, view, appeared_pixels, feature_support)
 
         # Motion states, with memory over frames.
-        appeared = evidence.free_space.appeared
-        motion_states = {track: self._motion_state(track, appeared[track], stamp) for track in tracks}
+        appeared_fractions = evidence.free_space.appeared_fractions
+        motion_states = {track: self._motion_state(track, appeared_fractions[track], stamp) for track in tracks}
 
         # Masks, refined by depth, and the positions that they show.
         excluded = [track for track in tracks if not self._is_trackable(motion_states[track])]
-        refined = self._refine_masks(excluded, tracks, view, newly_occupied)
+        refined = self._refine_masks(excluded, tracks, view, appeared_pixels)
         size = view.missing.shape
         masks = static_masks(
             [refined[track] for track in excluded], list(refined.values()), size, self._config.static_mask
         )
-        visible = visible_masks(tracks, refined, view.missing)
-        self._record_visible_states(dict(zip(tracks, visible, strict=True)), refined, view)
+        in_result = result_masks(tracks, refined, view.missing)
+        self._record_visible_states(dict(zip(tracks, in_result, strict=True)), refined, view)
 
         objects = [
             TrackedObject(
@@ -122,28 +122,28 @@ class MotionClassifier(StatefulComponent):
                 missed=track.missed,
                 **_world_attributes(track, stamp),
             )
-            for track, mask in zip(tracks, visible, strict=True)
+            for track, mask in zip(tracks, in_result, strict=True)
         ]
-        return FrameObjects(objects, masks.static, masks.without_people, evidence.vote.vote_pairs)
+        return FrameObjects(objects, masks.static, masks.for_map, evidence.vote.vote_pairs)
 
-    def register(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
-        """Transform what was detected in a guessed world frame into that of the map, see `InstanceTracker.register`.
+    def move_to_map(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
+        """Transform what was detected in a guessed world frame into that of the map, see `InstanceTracker.move_to_map`.
 
         Args:
             T_new_old: Transform from the guessed world frame to that of the map, float64, shape :math:`(4, 4)`.
             all_tracks: True to transform all detections, because they were made in another part of the map.
         """
-        self._tracker.register(T_new_old, all_tracks=all_tracks)
+        self._tracker.move_to_map(T_new_old, all_tracks=all_tracks)
 
-    def add_view(self, view: DepthView, T_dw: Tensor, static: Tensor) -> None:
+    def add_view(self, view: DepthView, T_dw: Tensor, map_mask: Tensor) -> None:
         """Store the static surfaces of a frame, once its pose is known, see `StaticSurfaces.add_view`.
 
         Args:
             view: Depth of the frame.
             T_dw: Pose of the frame, world to camera, float64, shape :math:`(4, 4)`.
-            static: Pixels without people and moving objects, bool, shape :math:`(H, W)`.
+            map_mask: Pixels without people and moving objects, see `FrameObjects`, bool, shape :math:`(H, W)`.
         """
-        self._static_surfaces.add_view(view, T_dw, static)
+        self._static_surfaces.add_view(view, T_dw, map_mask)
 
     def drop_views(self) -> None:
         """Drop the stored surfaces: the pose of the next frames relative to them is a guess."""
@@ -158,7 +158,7 @@ class MotionClassifier(StatefulComponent):
         self._tracker.apply_world_correction(T_new_old)
         self._static_surfaces.apply_world_correction(T_new_old)
 
-    def apply_corrections(self, objects: FrameObjects) -> FrameObjects:
+    def correct_result(self, objects: FrameObjects) -> FrameObjects:
         """Return the objects of the last frame in the world frame to which the tracker was corrected since then.
 
         Args:
@@ -184,7 +184,7 @@ class MotionClassifier(StatefulComponent):
         tracks: list[Track],
         previous_stamp: float,
         view: DepthView,
-        newly_occupied: NewlyOccupied,
+        appeared_pixels: AppearedPixels,
         feature_support: FeatureSupport,
     ) -> MotionEvidence:
         """Collect the evidence of motion in a frame, and record it in the tracks.
@@ -193,7 +193,7 @@ class MotionClassifier(StatefulComponent):
             tracks: Tracks of the frame, detected or missed.
             previous_stamp: Timestamp of the previous frame, seconds.
             view: Depth of the frame, with the pose from frame-to-frame motion.
-            newly_occupied: Newly occupied pixels of the frame.
+            appeared_pixels: Pixels of the frame that appeared.
             feature_support: Features of the frame and their agreement with the camera motion.
         """
         config, stamp = self._config, view.stamp
@@ -203,8 +203,8 @@ class MotionClassifier(StatefulComponent):
 
         # Independent evidence, not in the paper: free space. An object of which most appeared needs no votes: a new one
         # has no earlier distance to compare, and of a known one this shows the motion directly.
-        free_space = free_space_evidence(tracks, pairs, view, newly_occupied, config.free_space, self._camera)
-        appeared = {track for track in detected if free_space.has_appeared(track)}
+        free_space = free_space_evidence(tracks, pairs, view, appeared_pixels, config.free_space, self._camera)
+        appeared = {track for track in detected if free_space.has_mostly_appeared(track)}
 
         # Spatial-reasoned Hough voting (Sec. III-C, Alg. 1).
         vote = hough_vote_evidence(pairs, free_space, previous_stamp, config.voting)
@@ -212,10 +212,10 @@ class MotionClassifier(StatefulComponent):
         # Independent evidence, not in the paper: features, which show slow motions earlier. Only cloud pixels count,
         # because a mask can contain other objects: the mask of a table contains the arms of people who sit at it.
         on_objects = feature_support.on_objects([track.cloud_pixels for track in tracks])
-        self._add_shifts(tracks, feature_support, on_objects, view)
-        shifted = {track for track in tracks if track.last_shifted == stamp}
         # The camera motion is measured relative to the object with most features, such as a table that fills the image.
         with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
+        self._add_shifts(tracks, with_most_inliers, feature_support, on_objects, view)
+        shifted = {track for track in tracks if track.last_shifted == stamp}
         for track in (appeared | vote.dynamic | shifted) - with_most_inliers:
             track.mark_dynamic(stamp)
         for track, is_supported in zip(tracks, feature_support.supports(on_objects).tolist(), strict=True):
@@ -229,21 +229,19 @@ class MotionClassifier(StatefulComponent):
         return MotionEvidence(free_space, vote, chamfer)
 
     def _refine_masks(
-        self, excluded: Sequence[Track], tracks: Sequence[Track], view: DepthView, newly_occupied: NewlyOccupied
+        self, excluded: Sequence[Track], tracks: Sequence[Track], view: DepthView, appeared_pixels: AppearedPixels
     ) -> dict[Track, RefinedMask]:
         """Return the refined masks of the excluded objects and of all people; most excluded objects are people."""
         people = [track for track in tracks if track.label == PERSON]
         refinable = list(dict.fromkeys([*excluded, *people]))
-        refiner = MaskRefiner(refinable, view, newly_occupied, self._static_surfaces, self._config, self._camera)
+        refiner = MaskRefiner(refinable, view, appeared_pixels, self._static_surfaces, self._config, self._camera)
         return {track: refiner.refine(track) for track in refinable}
 
-    def _record_visible_states(
-        self, visible: Mapping[Track, Tensor], refined: Container[Track], view: DepthView
-    ) -> None:
+    def _record_visible_states(self, masks: Mapping[Track, Tensor], refined: Container[Track], view: DepthView) -> None:
         """Record the states of the detected objects, with the positions that refined masks show."""
-        detected = [track for track in visible if not track.missed]
+        detected = [track for track in masks if not track.missed]
         measured = [track for track in detected if track in refined]
-        positions = self._surface_centroids(view, [visible[track] for track in measured])
+        positions = self._surface_centroids(view, [masks[track] for track in measured])
         position = dict(zip(measured, positions, strict=True))
         for track in detected:
             track.record_visible_state(position.get(track))
@@ -259,26 +257,40 @@ class MotionClassifier(StatefulComponent):
         }
 
     def _add_shifts(
-        self, tracks: Sequence[Track], feature_support: FeatureSupport, on_objects: Tensor, view: DepthView
+        self,
+        tracks: Sequence[Track],
+        reference: Container[Track],
+        feature_support: FeatureSupport,
+        on_objects: Tensor,
+        view: DepthView,
     ) -> None:
-        """Add to each object how far its features (``on_objects``) have moved against the camera motion."""
+        """Add to each object how far its features have moved against the camera motion.
+
+        Args:
+            tracks: Tracks of the frame.
+            reference: Tracks relative to which the camera motion is measured; nothing is added to them.
+            feature_support: Features of the frame.
+            on_objects: Features of each object, see `FeatureSupport.on_objects`.
+            view: Depth of the frame.
+        """
         config = self._config.feature_shift
         if not config.enabled:
             return
         for track, shift in zip(tracks, feature_support.shifts(on_objects, view.missing.shape), strict=True):
-            track.add_shift(view.stamp, shift, config.time_span)
+            if track not in reference:
+                track.add_shift(view.stamp, shift, config.time_span)
 
     def _rigid_with_most_inliers(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
         """Return the rigid objects that have most of the inliers; people can have most of them on parts at rest."""
         flags = zip(tracks, have_most_inliers.tolist(), strict=True)
         return {track for track, has_most in flags if has_most and track.is_rigid}
 
-    def _motion_state(self, track: Track, appeared: list[float], stamp: float) -> MotionState:
+    def _motion_state(self, track: Track, appeared_fractions: list[float], stamp: float) -> MotionState:
         """Return the motion state of an object.
 
         Args:
             track: Track of the object.
-            appeared: Fraction of the object's pixels that appeared, for each time span of the free-space check.
+            appeared_fractions: Fraction of the object's pixels that appeared, for each time span of the check.
             stamp: Timestamp of the frame, seconds.
         """
         config = self._config.static_mask
@@ -286,14 +298,14 @@ class MotionClassifier(StatefulComponent):
         has_shifted = stamp - track.last_shifted <= config.hold_dynamic_time
         if track.last_dynamic == stamp or has_shifted:
             return MotionState.DYNAMIC
-        at_rest = [fraction < _STATIC_FRACTION for fraction in appeared]
+        at_rest = [fraction < _STATIC_FRACTION for fraction in appeared_fractions]
         at_rest_over_all = len(at_rest) > 0 and all(at_rest)
         rarely_detected = track.total_score < _MIN_MISSED_SCORE and track.last_dynamic == -torch.inf
         if track.missed and (at_rest_over_all or rarely_detected):
             return MotionState.STATIC
         # A walking person pauses, but a rigid thing that is at rest over all known time spans has stopped.
-        known = [rest for rest, fraction in zip(at_rest, appeared, strict=True) if not isnan(fraction)]
-        if track.label in RIGID and known and all(known):
+        known = [rest for rest, fraction in zip(at_rest, appeared_fractions, strict=True) if not isnan(fraction)]
+        if track.has_rigid_label and known and all(known):
             return MotionState.STATIC
         if self._is_held_dynamic(track, stamp):
             return MotionState.DYNAMIC

@@ -12,13 +12,13 @@ import torch
 
 from v3d_torch.config import ChamferConfig, FreeSpaceConfig, VotingConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.objects.appeared_pixels import MIN_REGION_SIDE, AppearedPixels
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.free_space_check import vacated_fractions
 from v3d_torch.objects.intra_object_motion import intra_object_motion
-from v3d_torch.objects.newly_occupied import MIN_REGION_SIDE, NewlyOccupied
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.objects.voting import vote_with_free_space
-from v3d_torch.segmentation.coco import RIGID, UNLABELLED
+from v3d_torch.segmentation.coco import UNLABELLED
 
 MOVED_FRACTION = 0.5
 """Minimum fraction of the visible points of a moved object that appeared or vacated: contours and partial occlusion
@@ -57,18 +57,20 @@ class FreeSpaceEvidence:
     """Result of the free-space check for the objects of a frame.
 
     Attributes:
-        appeared: Fraction of each object's pixels that appeared, for each time span of the check; NaN if unknown.
-        vacated: Fraction of the points of each earlier detection whose position is free space now; NaN if unknown.
+        appeared_fractions: Fraction of each object's pixels that appeared, for each time span of the check; NaN if
+            unknown.
+        vacated_fractions: Fraction of the points of each earlier detection whose position is free space now; NaN if
+            unknown.
         enabled: False if the free-space check is turned off.
     """
 
-    appeared: dict[Track, list[float]]
-    vacated: dict[Detection3D, float]
+    appeared_fractions: dict[Track, list[float]]
+    vacated_fractions: dict[Detection3D, float]
     enabled: bool
 
-    def has_appeared(self, track: Track) -> bool:
+    def has_mostly_appeared(self, track: Track) -> bool:
         """Check whether most of an object appeared over some time span; False if the check is turned off."""
-        return self.enabled and any(fraction >= MOVED_FRACTION for fraction in self.appeared[track])
+        return self.enabled and any(fraction >= MOVED_FRACTION for fraction in self.appeared_fractions[track])
 
     def allows_motion(self, track: Track, previous: Detection3D, min_fraction: float) -> bool:
         """Check whether enough of an object appeared or vacated.
@@ -81,7 +83,7 @@ class FreeSpaceEvidence:
         Returns:
             True if the fraction is reached, or if the check is turned off.
         """
-        fractions = (*self.appeared[track], self.vacated[previous])
+        fractions = (*self.appeared_fractions[track], self.vacated_fractions[previous])
         return not self.enabled or any(fraction >= min_fraction for fraction in fractions)
 
 
@@ -89,7 +91,7 @@ def free_space_evidence(
     tracks: list[Track],
     pairs: dict[float, DetectionPairs],
     view: DepthView,
-    newly_occupied: NewlyOccupied,
+    appeared_pixels: AppearedPixels,
     config: FreeSpaceConfig,
     camera: PinholeCamera,
 ) -> FreeSpaceEvidence:
@@ -99,22 +101,22 @@ def free_space_evidence(
         tracks: Tracks of the frame.
         pairs: Pairs of detections for each time span.
         view: Depth and pose of the frame.
-        newly_occupied: Newly occupied pixels of the frame.
+        appeared_pixels: Pixels of the frame that appeared.
         config: Tolerances.
         camera: Camera of the frame.
     """
     # Network masks are coarse: all known pixels of furniture beside a moving person can be those of the person.
     # Therefore furniture has moved only if most of all its pixels have appeared.
-    of_all = [track.label in RIGID for track in tracks]
+    of_all = [track.has_rigid_label for track in tracks]
     # A far unlabelled region is smaller than other objects, but each of its pixels was new when it was proposed.
     least = min(config.min_points, MIN_REGION_SIDE**2)
     min_pixels = [least if track.label == UNLABELLED else config.min_points for track in tracks]
-    appeared = newly_occupied.fractions([track.cloud_pixels for track in tracks], min_pixels, of_all)
+    appeared = appeared_pixels.fractions([track.cloud_pixels for track in tracks], min_pixels, of_all)
     previous = list(dict.fromkeys(earlier for of_time_span in pairs.values() for earlier, _ in of_time_span.values()))
     vacated = vacated_fractions([detection.cloud for detection in previous], view, camera, config)
     return FreeSpaceEvidence(
-        appeared=dict(zip(tracks, appeared.tolist(), strict=True)),
-        vacated=dict(zip(previous, vacated.tolist(), strict=True)),
+        appeared_fractions=dict(zip(tracks, appeared.tolist(), strict=True)),
+        vacated_fractions=dict(zip(previous, vacated.tolist(), strict=True)),
         enabled=config.enabled,
     )
 
@@ -136,7 +138,7 @@ class VoteEvidence:
 
 
 def hough_vote_evidence(
-    pairs: dict[float, DetectionPairs],
+    pairs_by_span: dict[float, DetectionPairs],
     free_space: FreeSpaceEvidence,
     previous_stamp: float,
     config: VotingConfig,
@@ -144,7 +146,7 @@ def hough_vote_evidence(
     """Vote over all time spans (paper, Alg. 1).
 
     Args:
-        pairs: Pairs of detections for each time span.
+        pairs_by_span: Pairs of detections for each time span.
         free_space: Result of the free-space check.
         previous_stamp: Timestamp of the previous frame, seconds.
         config: Time spans and thresholds.
@@ -158,7 +160,7 @@ def hough_vote_evidence(
     dynamic: set[Track] = set()
     vote_pairs: set[tuple[int, int]] = set()
     for time_span in config.time_spans:
-        compared = pairs[time_span]
+        compared = pairs_by_span[time_span]
         if time_span == 0:  # only objects of the previous frame are compared (Alg. 1)
             compared = {track: pair for track, pair in compared.items() if pair[0].stamp >= previous_stamp}
         if not compared:
@@ -170,9 +172,9 @@ def hough_vote_evidence(
             )
         previous = torch.stack([earlier.centroid for earlier, _ in compared.values()])
         current = torch.stack([newest.centroid for _, newest in compared.values()])
-        votes, is_dynamic, pair_votes = vote_with_free_space(previous, current, moved, config)
+        votes, is_dynamic, counted_votes = vote_with_free_space(previous, current, moved, config)
         ids = [track.id for track in compared]
-        vote_pairs |= {(ids[voter], ids[candidate]) for candidate, voter in pair_votes.nonzero().tolist()}
+        vote_pairs |= {(ids[voter], ids[candidate]) for candidate, voter in counted_votes.nonzero().tolist()}
         for track, count, flag in zip(compared, votes.tolist(), is_dynamic.tolist(), strict=True):
             max_votes[track] = max(max_votes.get(track, 0), count)
             if flag:
@@ -216,7 +218,7 @@ class MotionEvidence:
     """Evidence of motion in a frame.
 
     Attributes:
-        free_space: Pixels of the objects that appeared or vacated.
+        free_space: Fractions of the objects that appeared or vacated.
         vote: Votes over all time spans.
         chamfer: Distances between clouds of objects that the vote leaves as static.
     """

@@ -223,7 +223,7 @@ class Silhouette:
             return 0.0
         return float((np.abs(self._measured_depth(depth) - self._z) < DEPTH_TOLERANCE).mean())
 
-    def count_seen_through(self, depth: Tensor) -> int:
+    def count_vacated(self, depth: Tensor) -> int:
         """Count the projected points behind which a surface is measured, so that their place is empty.
 
         Args:

@@ -19,12 +19,12 @@ class StaticMasks(NamedTuple):
 
     Attributes:
         static: Pixels outside of all excluded objects, bool, shape :math:`(H, W)`.
-        without_people: Pixels of ``static`` at a larger distance from all excluded objects and people, bool, shape
+        for_map: Pixels of ``static`` at a larger distance from all excluded objects and people, bool, shape
             :math:`(H, W)`.
     """
 
     static: Tensor
-    without_people: Tensor
+    for_map: Tensor
 
 
 def static_masks(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.se3 import transform_points
-from v3d_torch.objects.association import vacancy_log_ratio
+from v3d_torch.objects.association import vacated_log_ratio
 from v3d_torch.objects.feature_shift import FeatureShift, sum_shifts
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.object_state import ObjectState
@@ -109,8 +109,8 @@ class Track:
         total_score: Sum of the scores of all detections.
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
         appearance_points: Mean number of points of the views in this histogram, with the same weights.
-        vacant_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
-        vacancy: Evidence of the empty place, see `vacancy_log_ratio`.
+        vacated_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
+        vacated_evidence: Evidence of the empty place, see `vacated_log_ratio`.
         dynamic_frames: Number of frames in which free space, votes or features showed a motion of the object.
         last_dynamic: Timestamp of the last of these frames, seconds.
         last_deforming: Timestamp of the last frame in which the object deformed, see `chamfer_evidence`, seconds.
@@ -135,8 +135,8 @@ class Track:
     total_score: float = 0.0
     appearance: Tensor | None = None
     appearance_points: float = 0.0
-    vacant_time: float = 0.0
-    vacancy: float = 0.0
+    vacated_time: float = 0.0
+    vacated_evidence: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
@@ -161,12 +161,17 @@ class Track:
         return not self.is_rigid or self.last_dynamic > -torch.inf
 
     @property
+    def has_rigid_label(self) -> bool:
+        """True if the class of most detections is that of furniture or another thing without parts that move."""
+        return self.label in RIGID
+
+    @property
     def is_rigid(self) -> bool:
-        """True for furniture and other things, which move as a whole or not at all.
+        """True for furniture and other things, which move as a whole or not at all, and were never detected as living.
 
         A person at the border of the image is often detected as furniture.
         """
-        return self.label in RIGID and not self.may_be_living
+        return self.has_rigid_label and not self.may_be_living
 
     @property
     def may_be_living(self) -> bool:
@@ -236,16 +241,16 @@ class Track:
         """
         return self._predict_stop(self._filter.state, stamp)
 
-    def earlier_cloud(self) -> Tensor | None:
+    def predict_previous_cloud(self) -> Tensor | None:
         """Predict the cloud of the detection before the newest at the time of the newest, with the current velocity.
 
         Returns:
-            Point cloud, world frame, metres, float64, shape :math:`(P, 3)`; None if there is no earlier detection.
+            Point cloud, world frame, metres, float64, shape :math:`(P, 3)`; None if there is one detection only.
         """
         if len(self.detections) < 2:
             return None
-        earlier = self.detections[-2]
-        return earlier.cloud.to(torch.float64) + self.velocity * (self.newest.stamp - earlier.stamp)
+        previous = self.detections[-2]
+        return previous.cloud.to(torch.float64) + self.velocity * (self.newest.stamp - previous.stamp)
 
     def centroid_sigma(self, detection: Detection3D) -> float:
         """Return the standard deviation of the centroid of a detection from that of the whole object, metres.
@@ -266,7 +271,7 @@ class Track:
             self.first_stamp = detection.stamp
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
-        self.vacant_time = self.vacancy = 0.0
+        self.vacated_time = self.vacated_evidence = 0.0
         self.detections.append(detection)
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
@@ -285,16 +290,16 @@ class Track:
             oldest = state.stamp - _STATE_HISTORY
             self.history = [each for each in self.history if each.stamp >= oldest] + [state]
 
-    def add_vacancy(self, stamp: float, seconds: float) -> None:
+    def add_vacated_time(self, stamp: float, seconds: float) -> None:
         """Record that the predicted place was observed to be empty.
 
         Args:
             stamp: Timestamp of the observation, seconds.
             seconds: Time for which it was observed.
         """
-        self.vacant_time += seconds
-        evidence = vacancy_log_ratio(self.vacant_time, self._filter.state.motion_variance(stamp - self.newest.stamp))
-        self.vacancy = min(self.vacancy, evidence)
+        self.vacated_time += seconds
+        evidence = vacated_log_ratio(self.vacated_time, self._filter.state.motion_variance(stamp - self.newest.stamp))
+        self.vacated_evidence = min(self.vacated_evidence, evidence)
 
     def drop_masks(self) -> None:
         """Drop the masks: the object is not detected, and not predicted either."""

@@ -187,7 +187,7 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
         + overlap_log_ratio(coverage, overlap, visible)
         + _appearance_evidence(predicted.tracks, detected, [len(track.newest.cloud) for track in predicted.tracks])
         + class_log_ratio(same_class)
-        + torch.tensor([[track.vacancy] for track in predicted.tracks], dtype=torch.float64)
+        + torch.tensor([[track.vacated_evidence] for track in predicted.tracks], dtype=torch.float64)
     )
     return evidence.masked_fill(~possible, -torch.inf)
 

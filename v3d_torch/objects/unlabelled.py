@@ -1,9 +1,9 @@
-"""Unlabelled instances: newly occupied regions that no instance of the segmentation explains.
+"""Unlabelled instances: regions that appeared, and that no instance of the segmentation accounts for.
 
 The network misses tilted or partly visible people, and has no class for a carried box. But the points of moving objects
 lie in space that an earlier view observed as free. Connected regions of such pixels become instances without a class.
-A person or animal explains all such pixels in its mask. A thing explains them only if it has moved itself: otherwise
-something else is in front of it, such as a box before a cupboard, or only this part of its mask moves.
+A person or animal accounts for all such pixels in its mask. A thing accounts for them only if it has moved itself:
+otherwise something else is in front of it, such as a box before a cupboard, or only this part of its mask moves.
 """
 
 from __future__ import annotations
@@ -15,40 +15,40 @@ from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
+from v3d_torch.objects.appeared_pixels import MIN_REGION_SIDE, AppearedPixels
 from v3d_torch.objects.motion_evidence import MOVED_FRACTION
-from v3d_torch.objects.newly_occupied import MIN_REGION_SIDE, NewlyOccupied
 from v3d_torch.objects.resampling import subsample, upsample_nearest
 from v3d_torch.segmentation.coco import RIGID, UNLABELLED
 from v3d_torch.types import Instances
 
 _OPENING_KERNEL = np.ones((MIN_REGION_SIDE, MIN_REGION_SIDE), np.uint8)
-"""Isolated newly occupied pixels are depth noise; opening by this kernel removes them (pixels of `NewlyOccupied`)."""
+"""Isolated pixels that appeared are depth noise; opening by this kernel removes them (pixels of `AppearedPixels`)."""
 
 _RIM_KERNEL = np.ones((5, 5), np.uint8)
 """Distance within which pixels belong to the contour of an instance, which a coarse mask cuts off (pixels of
-`NewlyOccupied`)."""
+`AppearedPixels`)."""
 
 
 def unlabelled_instances(
-    newly_occupied: NewlyOccupied, instances: Instances, depth: Tensor, camera: PinholeCamera, min_area: float
+    appeared_pixels: AppearedPixels, instances: Instances, depth: Tensor, camera: PinholeCamera, min_area: float
 ) -> Instances:
-    """Propose instances from newly occupied regions that no other instance explains.
+    """Propose instances from regions that appeared, and that no other instance accounts for.
 
     Args:
-        newly_occupied: Newly occupied pixels of the frame.
+        appeared_pixels: Pixels of the frame that appeared.
         instances: Instances of the frame, from the segmenter or propagated from the previous frame.
         depth: Depth of the frame, metres, shape :math:`(1, H, W)`.
         camera: Camera of the frame.
         min_area: Minimum area of a region, square metres; smaller regions are noise.
 
     Returns:
-        Instances of class `UNLABELLED` with score 0 and empty boxes; none if nothing is newly occupied.
+        Instances of class `UNLABELLED` with score 0 and empty boxes; none if nothing appeared.
     """
-    stride, (height, width) = newly_occupied.stride, depth.shape[-2:]
-    appeared = cv2.morphologyEx(newly_occupied.is_new.to(torch.uint8).numpy(), cv2.MORPH_OPEN, _OPENING_KERNEL)
+    stride, (height, width) = appeared_pixels.stride, depth.shape[-2:]
+    appeared = cv2.morphologyEx(appeared_pixels.appeared.to(torch.uint8).numpy(), cv2.MORPH_OPEN, _OPENING_KERNEL)
     coarse_masks = subsample(instances.masks, stride)
-    explained = _explained_pixels(instances.labels, coarse_masks, torch.from_numpy(appeared > 0))
-    appeared[cv2.dilate(explained.to(torch.uint8).numpy(), _RIM_KERNEL) > 0] = 0
+    accounted = _accounted_pixels(instances.labels, coarse_masks, torch.from_numpy(appeared > 0))
+    appeared[cv2.dilate(accounted.to(torch.uint8).numpy(), _RIM_KERNEL) > 0] = 0
     count, region = cv2.connectedComponents(appeared)
     pixel_area = np.square(depth[0, ::stride, ::stride].to(torch.float64).numpy() * stride) / (camera.fx * camera.fy)
     area = np.bincount(region.ravel(), weights=pixel_area.ravel(), minlength=count)
@@ -59,13 +59,13 @@ def unlabelled_instances(
     return Instances.from_masks(masks, torch.full((len(large),), UNLABELLED))
 
 
-def _explained_pixels(labels: Tensor, masks: Tensor, appeared: Tensor) -> Tensor:
+def _accounted_pixels(labels: Tensor, masks: Tensor, appeared: Tensor) -> Tensor:
     """Return the pixels of the instances that can move by themselves, or of which most appeared.
 
     Args:
         labels: Class indices of N instances, int64, shape (N,).
         masks: Pixels of the instances, bool, shape (N, h, w).
-        appeared: Newly occupied pixels, bool, shape (h, w).
+        appeared: Pixels that appeared, bool, shape (h, w).
 
     Returns:
         Bool, shape (h, w).
@@ -73,5 +73,5 @@ def _explained_pixels(labels: Tensor, masks: Tensor, appeared: Tensor) -> Tensor
     packed = pack_masks(masks)
     new = count_common_pixels(packed, pack_masks(appeared[None]))[:, 0]
     is_rigid = torch.tensor([label in RIGID for label in labels.tolist()], dtype=torch.bool)
-    explains = ~is_rigid | (new >= MOVED_FRACTION * count_pixels(packed))
-    return torch.from_numpy(masks[explains].numpy().any(axis=0))  # NumPy is faster here than torch
+    accounts = ~is_rigid | (new >= MOVED_FRACTION * count_pixels(packed))
+    return torch.from_numpy(masks[accounts].numpy().any(axis=0))  # NumPy is faster here than torch

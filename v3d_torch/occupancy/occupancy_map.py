@@ -123,7 +123,7 @@ class OccupancyMap:
                 f"the pose T_wc of a depth image is {T_wc.tolist()}; give a rigid transform, at most {limit:.0f} m from"
                 " the origin"
             )
-        limits = config.voxel_size, config.max_depth, config.depth_tolerance
+        limits = config.voxel_size, config.max_depth, config.inverse_depth_tolerance
         blocks = copy.copy(self.blocks)  # shares the voxels, while other threads read the blocks as they were
         blocks.add(observe_voxels(depth, static, rays, T_wc, *limits), self.sensor_model)
         if len(blocks) > config.max_blocks:

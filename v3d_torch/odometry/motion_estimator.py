@@ -31,7 +31,7 @@ _MAX_ROTATION_RATE = 6.3
 """Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
 
 
-def no_pairs() -> Tensor:
+def no_matches() -> Tensor:
     """Return an empty list of matches, int64, shape (0, 2)."""
     return torch.zeros(0, 2, dtype=torch.int64)
 
@@ -42,15 +42,15 @@ class RelativeMotion:
 
     Attributes:
         T_ba: Maps points from camera a to camera b, float64, shape :math:`(4, 4)`.
-        pairs: Inlier matches (feature of a, feature of b), int64, shape :math:`(K, 2)`; K = 0 for a motion found by
+        inlier_matches: Inliers (feature of a, feature of b), int64, shape :math:`(K, 2)`; K = 0 for a motion found by
             dense alignment.
         matches: All matches by descriptors, inliers and outliers (feature of a, feature of b), int64, shape
             :math:`(M, 2)`.
     """
 
     T_ba: Tensor
-    pairs: Tensor
-    matches: Tensor = field(default_factory=no_pairs, kw_only=True)
+    inlier_matches: Tensor
+    matches: Tensor = field(default_factory=no_matches, kw_only=True)
 
     @cached_property
     def xi(self) -> Tensor:
@@ -79,19 +79,21 @@ class RelativeMotion:
         distance, angle = float(self.xi[:3].norm()), float(self.xi[3:].norm())
         return distance <= max_speed * elapsed and angle <= _MAX_ROTATION_RATE * elapsed
 
-    def propagate_landmarks(self, landmarks: Tensor, count: int) -> Tensor:
-        """Landmark ids of the features of b, propagated from a by the inlier matches.
 
-        Args:
-            landmarks: Landmark id of each feature of a, int64, shape :math:`(N,)`; -1 = none.
-            count: Number of features of b.
+def propagate_landmarks(matches: Tensor, landmarks: Tensor, count: int) -> Tensor:
+    """Landmark ids of the features of view b, propagated from view a by matches.
 
-        Returns:
-            Landmark id of each feature of b, int64, shape ``(count,)``; -1 = none.
-        """
-        propagated = torch.full((count,), -1, dtype=torch.int64)
-        propagated[self.pairs[:, 1]] = landmarks[self.pairs[:, 0]]
-        return propagated
+    Args:
+        matches: Matches (feature of a, feature of b), int64, shape :math:`(K, 2)`.
+        landmarks: Landmark id of each feature of a, int64, shape :math:`(N,)`; -1 = none.
+        count: Number of features of b.
+
+    Returns:
+        Landmark id of each feature of b, int64, shape ``(count,)``; -1 = none.
+    """
+    propagated = torch.full((count,), -1, dtype=torch.int64)
+    propagated[matches[:, 1]] = landmarks[matches[:, 0]]
+    return propagated
 
 
 class MotionEstimator:
@@ -130,11 +132,11 @@ class MotionEstimator:
         selected = torch.nonzero(a.depth > 0)[:, 0]
         if initial_guess is not None:
             selected = selected[select_evenly(a.pixel[selected], config.max_features, self._cell)]
-        matches = match_descriptors(
+        match_of_feature = match_descriptors(
             a.descriptors[selected], b.descriptors, max_hamming=config.max_hamming, max_ratio=config.max_ratio
         )
-        matched = torch.nonzero(matches >= 0)[:, 0]
-        pairs = candidates = torch.stack([selected[matched], matches[matched]], dim=1)
+        matched = torch.nonzero(match_of_feature >= 0)[:, 0]
+        pairs = matches = torch.stack([selected[matched], match_of_feature[matched]], dim=1)
         if pairs.shape[0] < config.min_inliers:
             return None
         epipolar = epipolar_inliers(
@@ -158,5 +160,5 @@ class MotionEstimator:
         )
         if int(pose.inliers.sum()) < config.min_inliers:
             return None
-        motion = RelativeMotion(pose.T_cw, pairs[pose.inliers], matches=candidates)
+        motion = RelativeMotion(pose.T_cw, pairs[pose.inliers], matches=matches)
         return motion if motion.is_plausible(elapsed, config.max_speed) else None

@@ -14,7 +14,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.odometry.dense_aligner import DenseAligner
 from v3d_torch.odometry.dense_view import DenseView
-from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion, no_pairs
+from v3d_torch.odometry.motion_estimator import MotionEstimator, RelativeMotion, no_matches, propagate_landmarks
 from v3d_torch.types import RGBDFrame
 
 
@@ -45,22 +45,23 @@ class CameraMotion:
         T_cp: Maps points from the previous camera to the current one, float64, shape :math:`(4, 4)`.
         velocity: ``se3_log(T_cp)`` divided by the time, ``[m/s, rad/s]``, float64, shape :math:`(6,)`: the velocity of
             static points in the camera frame. `CameraState.twist`, that of the camera, has the opposite sign.
-        pairs: Inlier matches (feature of the previous frame, feature of the current frame), int64, shape
+        inlier_matches: Inliers (feature of the previous frame, feature of the current frame), int64, shape
             :math:`(K, 2)`; K = 0 for a motion found by dense alignment, and for a prediction.
         is_measured: True if the motion was estimated from both frames, False if it is only predicted.
-        matches: All matches by descriptors, inliers and outliers, in the same form as ``pairs``, shape :math:`(M, 2)`.
+        matches: All matches by descriptors, inliers and outliers, in the same form, shape :math:`(M, 2)`. Slow
+            motions of objects are measured from them; without them they are not found by features.
     """
 
     T_cp: Tensor
     velocity: Tensor
-    pairs: Tensor
+    inlier_matches: Tensor
     is_measured: bool
-    matches: Tensor = field(default_factory=no_pairs, kw_only=True)
+    matches: Tensor = field(default_factory=no_matches, kw_only=True)
 
     def inlier_mask(self, count: int) -> Tensor:
         """Mask of the features of the current frame that are inliers, bool, shape ``(count,)``."""
         mask = torch.zeros(count, dtype=torch.bool)
-        mask[self.pairs[:, 1]] = True
+        mask[self.inlier_matches[:, 1]] = True
         return mask
 
     def residuals(self, previous: TrackedFrame | None, features: Features, camera: PinholeCamera) -> Tensor:
@@ -94,7 +95,7 @@ class CameraMotion:
         """
         if previous is None or previous.landmarks is None:
             return torch.full((count,), -1, dtype=torch.int64)
-        return RelativeMotion(self.T_cp, self.pairs).propagate_landmarks(previous.landmarks, count)
+        return propagate_landmarks(self.inlier_matches, previous.landmarks, count)
 
 
 class Odometry:
@@ -127,10 +128,10 @@ class Odometry:
         """
         motion = None if previous is None else self.register(previous, current, T_cp)
         if previous is None or motion is None:
-            return CameraMotion(T_cp, velocity, no_pairs(), is_measured=False)
+            return CameraMotion(T_cp, velocity, no_matches(), is_measured=False)
         elapsed = current.frame.stamp - previous.frame.stamp
         velocity = motion.velocity(elapsed)
-        return CameraMotion(motion.T_ba, velocity, motion.pairs, is_measured=True, matches=motion.matches)
+        return CameraMotion(motion.T_ba, velocity, motion.inlier_matches, is_measured=True, matches=motion.matches)
 
     def register(self, previous: TrackedFrame, current: TrackedFrame, T_ba: Tensor) -> RelativeMotion | None:
         """Register two frames: the motion from an earlier frame "a" to a later frame "b".
@@ -150,7 +151,7 @@ class Odometry:
         alignment = self._align.align_views(self._dense_view(previous), self._dense_view(current), T_ba)
         if alignment is None:
             return None
-        motion = RelativeMotion(alignment.T_ba, no_pairs())
+        motion = RelativeMotion(alignment.T_ba, no_matches())
         return motion if motion.is_plausible(elapsed, self._max_speed) else None
 
     def _dense_view(self, tracked: TrackedFrame) -> DenseView:

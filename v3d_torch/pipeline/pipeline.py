@@ -244,15 +244,15 @@ class Pipeline:
         self.record.states.append_state(result)
         if isinstance(result, LiveResult):
             self.record.live.append_result(result)
-        self.record.dynamics.append_objects(frame, result, self.slam.up)
+        self.record.objects.append_objects(frame, result, self.slam.up)
         with self._stopwatch.paused():  # the frame rate is that of the system, without the evaluation
             self._evaluate_masks(frame, result)
-        for folder, static in zip(self._mask_folders, (result.static_mask, result.static_without_people), strict=True):
+        for folder, static in zip(self._mask_folders, (result.static_mask, result.map_mask), strict=True):
             if folder is not None:
                 write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)
         keyframe = self.slam.map.keyframe_at(frame.stamp)
         if keyframe is not None:
-            static = result.static_without_people
+            static = result.map_mask
             self.views.add(keyframe, frame.image, frame.depth, static, frame.depth_delay, result.T_dc)
             if not self.record.was_checked:
                 self.record.people_sizes += apparent_sizes(result.objects, frame.depth, self.slam.camera)

@@ -228,7 +228,7 @@ class RunRecord:
         states: State of the camera at each frame.
         live: Latencies of each frame of a live run; empty for a stored sequence.
         rejected: Number of live frames that were late, duplicate or out of order.
-        dynamics: Objects of all frames.
+        objects: Objects of all frames.
         snapshots: Frames for the figure of masks.
         most_dynamic_snapshot: Frame with the most votes for dynamic objects; of several, that with the most objects.
         mask_evaluation: Comparison of the masks with true masks.
@@ -252,7 +252,7 @@ class RunRecord:
     states: StateTable = field(default_factory=StateTable)
     live: LiveTable = field(default_factory=LiveTable)
     rejected: int = 0
-    dynamics: ObjectTable = field(default_factory=ObjectTable)
+    objects: ObjectTable = field(default_factory=ObjectTable)
     snapshots: list[Snapshot] = field(default_factory=list)
     most_dynamic_snapshot: Snapshot | None = None
     mask_evaluation: MaskEvaluation = field(default_factory=MaskEvaluation)

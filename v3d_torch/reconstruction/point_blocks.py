@@ -61,4 +61,4 @@ class PointBlocks:
 
 def _nearest_measurable(depth: Tensor, config: FreeSpaceConfig) -> Tensor:
     """Depth that a view must at least measure to observe a point, metres."""
-    return depth - (config.tolerance * depth.square()).clamp(min=config.min_tolerance)
+    return depth - (config.inverse_depth_tolerance * depth.square()).clamp(min=config.min_tolerance)

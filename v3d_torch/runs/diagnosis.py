@@ -112,7 +112,7 @@ def _cause_of_loss(pipeline: Pipeline, indices: Tensor) -> str:
                 f"at most {most} features of an image have depth, and a map starts with mapping.min_tracked={needed};"
                 " lower it, raise features.count, or record it again with more texture in view"
             )
-    has_masked_objects = torch.isin(indices, pipeline.record.dynamics.frames_with_masked_objects())
+    has_masked_objects = torch.isin(indices, pipeline.record.objects.frames_with_masked_objects())
     if 2 * int(has_masked_objects.sum()) > len(indices):
         return f"masked objects cover the images; see {RunFile.MASKS_FIGURE}, and try --segmenter none"
     return "no features can be tracked between frames; check camera and depth, and move the camera more slowly"

@@ -31,7 +31,7 @@ class RunFile(StrEnum):
     """State of the run. It exists from the first checkpoint of a run to its end."""
     FRAMES = "frames.parquet"
     STATES = "states.parquet"
-    DYNAMICS = "dynamics.parquet"
+    OBJECTS = "objects.parquet"
     MAP = "map.ply"
     MESH = "mesh.ply"
     CAMERA_PATH = "trajectory.ply"

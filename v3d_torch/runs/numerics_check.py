@@ -32,7 +32,7 @@ queries means unknown space."""
 MAY_BE_NAN = frozenset(
     {
         "InstanceClouds.centroid",  # of a cloud with too few points
-        "NewlyOccupied.appeared",  # if it is not known
+        "AppearedPixels.was_free",  # if it is not known
         "ObjectState.position",  # of an object that never had a clean cloud
         "TrackedObject.chamfer",  # if it was not measured
         "describe_appearance",  # of an instance with too few pixels

@@ -153,7 +153,7 @@ def _masked_fraction(path: Path) -> float:
 
 def _object_plot(run: StoredRun) -> dict[str, Any] | None:
     """Draw the objects over time; None without a table of objects, and no plot if the table is empty."""
-    if run.dynamics is None:
+    if run.objects is None:
         return None
     table = [
         ObjectRow(
@@ -164,7 +164,7 @@ def _object_plot(run: StoredRun) -> dict[str, Any] | None:
             votes=row["votes"],
             chamfer=row["chamfer"] if row["chamfer"] is not None else math.nan,
         )
-        for row in run.dynamics.to_pylist()
+        for row in run.objects.to_pylist()
     ]
     if not table:
         return {"count": 0}

@@ -61,7 +61,7 @@ class ResultTables:
         config: Configuration, YAML.
         frames: Table of frames.
         states: Table of the states of the camera.
-        dynamics: Table of objects.
+        objects: Table of objects.
     """
 
     trajectory: Trajectory
@@ -72,7 +72,7 @@ class ResultTables:
     config: str
     frames: pa.Table
     states: pa.Table
-    dynamics: pa.Table
+    objects: pa.Table
 
     def write(self, folder: Path) -> None:
         """Write all files to a folder, which is made if it is missing.
@@ -87,7 +87,7 @@ class ResultTables:
             write_trajectory(folder / RunFile.GROUNDTRUTH, self.groundtruth)
         write_parquet(folder / RunFile.FRAMES, self.frames)
         write_parquet(folder / RunFile.STATES, self.states)
-        write_parquet(folder / RunFile.DYNAMICS, self.dynamics)
+        write_parquet(folder / RunFile.OBJECTS, self.objects)
 
 
 def collect_tables(pipeline: Pipeline) -> ResultTables:
@@ -112,7 +112,7 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
         config=dump_config(slam.config),
         frames=_frame_table(pipeline),
         states=make_state_table(pipeline.record),
-        dynamics=_object_table(pipeline.record.dynamics),
+        objects=_object_table(pipeline.record.objects),
     )
 
 
@@ -133,25 +133,25 @@ def _frame_table(pipeline: Pipeline) -> pa.Table:
     return pa.table(columns)
 
 
-def _object_table(dynamics: ObjectTable) -> pa.Table:
+def _object_table(objects: ObjectTable) -> pa.Table:
     """Return the table of objects: one row per frame and object."""
-    x, y, z = dynamics["centroid"].T
-    state = torch.cat([dynamics["velocity"], dynamics["sigmas"], dynamics["box"]], dim=1)
-    motion_states, labels = [state.value for state in MotionState], dynamics["label"]
+    x, y, z = objects["centroid"].T
+    state = torch.cat([objects["velocity"], objects["sigmas"], objects["box"]], dim=1)
+    motion_states, labels = [state.value for state in MotionState], objects["label"]
     classes = {label: class_name(label) for label in labels.unique().tolist()}
     columns = {
-        "frame": dynamics["frame"],
-        "stamp": dynamics["stamp"],
-        "id": dynamics["id"],
+        "frame": objects["frame"],
+        "stamp": objects["stamp"],
+        "id": objects["id"],
         "class": [classes[label] for label in labels.tolist()],
         "x": x,
         "y": y,
         "z": z,
         **dict(zip(_STATE_COLUMNS, state.T, strict=True)),
-        "votes": dynamics["votes"],
-        "chamfer": dynamics["chamfer"],
-        "motion_state": [motion_states[code] for code in dynamics["motion_state"].tolist()],
-        "missed": dynamics["missed"],
+        "votes": objects["votes"],
+        "chamfer": objects["chamfer"],
+        "motion_state": [motion_states[code] for code in objects["motion_state"].tolist()],
+        "missed": objects["missed"],
     }
     arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
     return pa.table(arrays, schema=_DYNAMICS)

@@ -34,7 +34,7 @@ class StoredRun:
         evaluation: Scores; None without ground truth, if fewer than three poses have ground truth, or if the camera was
             not found in any frame.
         frames: Table with one row per frame; None if the file is missing.
-        dynamics: Table with one row per frame and object; None if the file is missing.
+        objects: Table with one row per frame and object; None if the file is missing.
         config_text: Text of the configuration file; empty if it is missing.
         config: Configuration; None if it is missing, or from a version with other keys.
     """
@@ -46,7 +46,7 @@ class StoredRun:
     groundtruth: Trajectory | None
     evaluation: Evaluation | None
     frames: pa.Table | None
-    dynamics: pa.Table | None
+    objects: pa.Table | None
     config_text: str
     config: Config | None
 
@@ -98,8 +98,8 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         groundtruth=truth,
         evaluation=evaluation,
         frames=_read_table(folder / RunFile.FRAMES, ("frame", "stamp", "status", "keyframe")),
-        dynamics=_read_table(
-            folder / RunFile.DYNAMICS, ("frame", "stamp", "id", "class", "votes", "chamfer", "motion_state", "missed")
+        objects=_read_table(
+            folder / RunFile.OBJECTS, ("frame", "stamp", "id", "class", "votes", "chamfer", "motion_state", "missed")
         ),
         config_text=config_text,
         config=_read_config(config_path),

@@ -62,7 +62,7 @@ class YOLOSegmenter:
         return self.segment(frame.image)
 
     def segment(self, image: Tensor) -> Instances:
-        """Segment an image of any size. The network sees a dark image brightened: it misses people in dark ones.
+        """Segment an image of any size. Dark images are brightened first, because the network misses people in them.
 
         Args:
             image: Colour image, uint8 RGB, shape :math:`(3, H, W)`.

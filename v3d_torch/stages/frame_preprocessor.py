@@ -16,7 +16,7 @@ from v3d_torch.segmentation.coco import LABELS
 from v3d_torch.segmentation.segmenter import segment_frame, segmenter_state_of, without_empty_masks
 from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.stages.protocols import DepthStage, FeatureStage
-from v3d_torch.stages.stage_checks import ReplaceableStages
+from v3d_torch.stages.replaceable_stages import ReplaceableStages
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame, Segmenter
 
@@ -67,6 +67,9 @@ class FramePreprocessor(ReplaceableStages):
         Args:
             frame: Next frame.
             prediction: See `segment_instances`.
+
+        Returns:
+            The frame with its depth, features and instances.
 
         Raises:
             InputError: If the frame is not valid or of another camera.

@@ -11,8 +11,8 @@ from typing import Protocol
 from torch import Tensor
 
 from v3d_torch.features.features import Features
+from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.instance_clouds import InstanceClouds
-from v3d_torch.objects.newly_occupied import NewlyOccupied
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.odometry.rolling_shutter import Readout
 from v3d_torch.types import Instances
@@ -87,11 +87,11 @@ class OdometryStage(Protocol):
 class ProposalStage(Protocol):
     """Proposal of moving regions without a class, such as `unlabelled_instances`; attribute ``propose_unlabelled``."""
 
-    def __call__(self, newly_occupied: NewlyOccupied, instances: Instances, depth: Tensor, /) -> Instances:
+    def __call__(self, appeared_pixels: AppearedPixels, instances: Instances, depth: Tensor, /) -> Instances:
         """Propose regions that move and that no given instance contains.
 
         Args:
-            newly_occupied: Newly occupied pixels of the frame.
+            appeared_pixels: Pixels of the frame that appeared.
             instances: Instances of the frame, from the segmenter or propagated from the previous frame.
             depth: Depth, metres, float32, shape :math:`(1, H, W)`; 0 = no measurement.
 

@@ -64,7 +64,7 @@ class CameraState:
         if not stamp >= self.stamp:  # the covariance would shrink, and become indefinite
             raise InputError(
                 f"no prediction for {stamp:.6f} s: the state is of {self.stamp:.6f} s; give a later time, or use"
-                " pose_at, which knows earlier ones"
+                " pose_at, which also has earlier times"
             )
         if stamp == math.inf:
             raise InputError("no prediction for inf s: the time is not finite; give seconds")

@@ -12,6 +12,7 @@ from v3d_torch.features.features import Features, sample_depth, to_measurements
 from v3d_torch.features.projection_matcher import LocalMap, ProjectedLandmarks, ProjectionMatcher
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose_unchecked
+from v3d_torch.types import LandmarkObserver
 
 _SEARCH_RADIUS = 10.0
 """Search radius around the projection of a landmark, pixels at octave 0; it grows with the octave. The error of a
@@ -25,7 +26,7 @@ _OCCLUSION_SIGMAS = 2.0
 
 
 @dataclass(frozen=True)
-class MapTracking:
+class MapTracking(LandmarkObserver):
     """Pose of a frame in the map.
 
     Attributes:
@@ -39,16 +40,6 @@ class MapTracking:
     landmarks: Tensor
     visible: Tensor
     information: Tensor
-
-    @property
-    def observed_landmarks(self) -> Tensor:
-        """Ids of the landmarks that were found, int64, shape :math:`(F,)`."""
-        return self.landmarks[self.landmarks >= 0]
-
-    @property
-    def count(self) -> int:
-        """Number of landmarks that were found."""
-        return len(self.observed_landmarks)
 
 
 class MapTracker:

@@ -85,6 +85,7 @@ class StateEstimator(StatefulComponent):
         """
         stamp, T_wc, status = poses.stamp, invert(poses.T_cw), poses.status or pose.status
         defines_world = status is TrackingStatus.TRACKED and pose.information is None  # the first keyframe
+        is_in_map = pose.information is not None or defines_world
         if pose.is_relocalised:  # it can have jumped, even if the previous frame was found
             self._pose_noise.interrupt()
         if pose.information is not None:
@@ -99,9 +100,9 @@ class StateEstimator(StatefulComponent):
             if status is TrackingStatus.LOST and self._last_found > -torch.inf:
                 lost_before, lost = self._filter.stamp - self._last_found, stamp - self._last_found
                 self._covariance = self._covariance + (lost**2 - lost_before**2) * _LOST_FOR_A_SECOND
-        if pose.information is not None or defines_world:
+        if is_in_map:
             self._last_found = stamp
-        if pose.information is not None or defines_world or motion.is_measured:
+        if is_in_map or motion.is_measured:
             self._filter_measured(stamp, T_wc, motion, is_continuous=not pose.is_relocalised)
             self._known_covariance, self._last_measured = self._covariance, stamp
         else:

@@ -43,8 +43,8 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
         images = [snapshot.frame.image for snapshot in record.snapshots]
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
         save_mask_figure(images, overlays, folder / "masks.png")
-    if len(record.dynamics):
-        figure = draw_objects(record.dynamics, trajectory, point_map.points, pipeline.slam.up, sequence.name)
+    if len(record.objects):
+        figure = draw_objects(record.objects, trajectory, point_map.points, pipeline.slam.up, sequence.name)
         save_figure(figure, folder / "objects.png")
     mapper = pipeline.slam.occupancy
     if mapper is not None and not mapper.map.is_empty:

@@ -101,7 +101,7 @@ class RunMessages:
         yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
         self._has_markers = True
         if slam.map.keyframe_at(stamp) is not None:
-            yield "/cloud", self._cloud(frame, objects.static_without_people)
+            yield "/cloud", self._cloud(frame, objects.map_mask)
             own = slam.map.own_keyframes
             T_ml = frames.camera_in_map(invert(stack_poses(own)), self._T_mw)
             yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)

@@ -9,21 +9,23 @@ from v3d_torch.segmentation.networks.blocks import Conv
 PROTOTYPES = 32
 """Number of prototypes, and of mask coefficients of each prediction."""
 
+_HIDDEN = 64
+"""Number of hidden channels."""
+
 
 class Proto(nn.Module):
     """Prototypes at a quarter of the input size, from the finest level of the pyramid.
 
     Args:
         channels: Channels of the finest level.
-        hidden: Hidden channels.
     """
 
-    def __init__(self, channels: int, hidden: int = 64) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        self.cv1 = Conv(channels, hidden, 3)
-        self.upsample = nn.ConvTranspose2d(hidden, hidden, 2, 2)
-        self.cv2 = Conv(hidden, hidden, 3)
-        self.cv3 = Conv(hidden, PROTOTYPES)
+        self.cv1 = Conv(channels, _HIDDEN, 3)
+        self.upsample = nn.ConvTranspose2d(_HIDDEN, _HIDDEN, 2, 2)
+        self.cv2 = Conv(_HIDDEN, _HIDDEN, 3)
+        self.cv3 = Conv(_HIDDEN, PROTOTYPES)
 
     def forward(self, pyramid: list[Tensor]) -> Tensor:
         """Compute prototypes, shape :math:`(B, 32, H/4, W/4)`, from maps at strides 8, 16 and 32."""

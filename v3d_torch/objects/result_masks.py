@@ -1,4 +1,4 @@
-"""Visible masks: the pixels of each object in the results of a frame."""
+"""Masks of the objects in the results of a frame: the pixels in which each object is visible."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _MIN_OWN_FRACTION = 0.5
 """Minimum fraction of a predicted mask that shows no detected object of the class; otherwise the object is hidden."""
 
 
-def visible_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask], missing: Tensor) -> list[Tensor]:
+def result_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask], missing: Tensor) -> list[Tensor]:
     """Return the visible pixels of each object, bool, shape :math:`(H, W)`.
 
     An object has its refined mask, if there is one, without the pixels that the margin adds where depth is missing or

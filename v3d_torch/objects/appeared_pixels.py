@@ -1,4 +1,4 @@
-"""Newly occupied pixels of a frame, from the free-space check."""
+"""Pixels of a frame that appeared, from the free-space check."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ from torch import Tensor
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 
 MIN_REGION_SIDE = 3
-"""Side of the smallest square of newly occupied pixels that is a region: fewer are depth noise. Pixels of
-`NewlyOccupied`."""
+"""Side of the smallest square of pixels that is a region that appeared: fewer are depth noise. Pixels of
+`AppearedPixels`."""
 
 
 @dataclass(frozen=True)
-class NewlyOccupied:
+class AppearedPixels:
     """Pixels whose point lies in space that earlier views observed as free.
 
     Attributes:
-        appeared: For each of B time spans, 1 if the space was free, 0 if it was occupied, NaN if unknown; float64,
+        was_free: For each of B time spans, 1 if the space was free, 0 if it was occupied, NaN if unknown; float64,
             every ``stride``-th pixel, shape :math:`(B, h, w)`.
         stride: Step between the pixels, pixels.
     """
 
-    appeared: Tensor
+    was_free: Tensor
     stride: int
 
     @cached_property
-    def is_new(self) -> Tensor:
+    def appeared(self) -> Tensor:
         """Pixels whose space was free over some time span, bool, shape :math:`(h, w)`."""
-        return torch.from_numpy((self.appeared.numpy() == 1).any(axis=0))  # NumPy is faster here than torch
+        return torch.from_numpy((self.was_free.numpy() == 1).any(axis=0))  # NumPy is faster here than torch
 
     @property
-    def previously_occupied(self) -> Tensor:
+    def was_occupied(self) -> Tensor:
         """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
-        return torch.from_numpy((self.appeared.numpy() == 0).any(axis=0) & ~self.is_new.numpy())
+        return torch.from_numpy((self.was_free.numpy() == 0).any(axis=0) & ~self.appeared.numpy())
 
     def fractions(self, masks: Sequence[Tensor], min_pixels: Sequence[int], of_all: Sequence[bool]) -> Tensor:
         """Return the fraction of each object's pixels that appeared.
@@ -50,11 +50,11 @@ class NewlyOccupied:
         Returns:
             Fraction for each object and time span, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
         """
-        rows = len(self.appeared)
+        rows = len(self.was_free)
         if not masks:
-            return self.appeared.new_zeros(0, rows)
+            return self.was_free.new_zeros(0, rows)
         inside = torch.stack([pack_masks(mask, self.stride) for mask in masks])
-        indicators = pack_masks(torch.cat([self.appeared == 1, ~self.appeared.isnan()]))
+        indicators = pack_masks(torch.cat([self.was_free == 1, ~self.was_free.isnan()]))
         counts = count_common_pixels(inside, indicators).to(torch.float64)
         new, known = counts[:, :rows], counts[:, rows:]
         total = torch.where(torch.tensor(of_all)[:, None], count_pixels(inside)[:, None], known)

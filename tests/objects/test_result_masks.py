@@ -10,8 +10,8 @@ from torch import Tensor
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.packed_masks import pack_masks
 from v3d_torch.objects.mask_refiner import RefinedMask
+from v3d_torch.objects.result_masks import result_masks
 from v3d_torch.objects.track import Detection3D, Track
-from v3d_torch.objects.visible_masks import visible_masks
 from v3d_torch.segmentation.coco import PERSON
 
 HEIGHT, WIDTH = 60, 80
@@ -42,19 +42,19 @@ def refined(surface: Tensor, mask: Tensor | None = None) -> RefinedMask:
 
 def test_object_without_a_refined_mask_has_the_mask_of_the_network() -> None:
     mask = box((10, 50), (20, 40))
-    assert torch.equal(visible_masks([track_of(mask)], {}, ALL_MEASURED)[0], mask)
+    assert torch.equal(result_masks([track_of(mask)], {}, ALL_MEASURED)[0], mask)
 
 
 def test_refined_mask_replaces_the_mask_of_the_network() -> None:
     track, better = track_of(box((10, 50), (20, 40))), box((14, 52), (24, 48))
-    (visible,) = visible_masks([track], {track: refined(better)}, ALL_MEASURED)
+    (visible,) = result_masks([track], {track: refined(better)}, ALL_MEASURED)
     assert torch.equal(visible, better)
 
 
 def test_margin_over_missing_depth_is_not_visible() -> None:
     own, grown = box((10, 50), (20, 40)), box((8, 52), (16, 44))
     track, missing = track_of(own), box((0, 30), (0, 80))
-    (visible,) = visible_masks([track], {track: refined(grown)}, missing)
+    (visible,) = result_masks([track], {track: refined(grown)}, missing)
     assert torch.equal(visible, own | (grown & ~missing))
 
 
@@ -62,7 +62,7 @@ def test_margin_over_missing_depth_is_not_visible() -> None:
 def test_margin_over_another_detected_object_of_the_class_is_not_visible(label: int, is_limited: bool) -> None:
     own, grown, other = box((10, 50), (20, 40)), box((8, 52), (16, 50)), box((10, 50), (42, 60))
     track = track_of(own)
-    first, second = visible_masks([track, track_of(other, label)], {track: refined(grown)}, ALL_MEASURED)
+    first, second = result_masks([track, track_of(other, label)], {track: refined(grown)}, ALL_MEASURED)
     assert torch.equal(first, grown & ~other if is_limited else grown)
     assert torch.equal(second, other)
 
@@ -70,18 +70,18 @@ def test_margin_over_another_detected_object_of_the_class_is_not_visible(label: 
 def test_pixels_that_the_network_gives_to_both_objects_stay_visible() -> None:
     own, other = box((10, 50), (20, 40)), box((10, 50), (30, 60))
     track = track_of(own)
-    assert torch.equal(visible_masks([track, track_of(other)], {track: refined(own)}, ALL_MEASURED)[0], own)
+    assert torch.equal(result_masks([track, track_of(other)], {track: refined(own)}, ALL_MEASURED)[0], own)
 
 
 def test_second_object_in_the_mask_of_a_detected_one_is_visible_as_itself() -> None:
     """The network draws one mask over two people; depth shows which pixels belong to which one."""
     both, near, far = box((10, 50), (20, 60)), box((10, 50), (20, 42)), box((10, 50), (40, 60))
     detected, missed = track_of(both), track_of(far, missed=True)
-    first, second = visible_masks([detected, missed], {detected: refined(near, both)}, ALL_MEASURED)
+    first, second = result_masks([detected, missed], {detected: refined(near, both)}, ALL_MEASURED)
     assert torch.equal(first, near)
     assert torch.equal(second, far & ~near)
     # Without it, a part at another depth can be an arm.
-    assert torch.equal(visible_masks([detected], {detected: refined(near, both)}, ALL_MEASURED)[0], both)
+    assert torch.equal(result_masks([detected], {detected: refined(near, both)}, ALL_MEASURED)[0], both)
 
 
 @pytest.mark.parametrize(("end", "is_visible"), [(30, True), (29, False)])
@@ -90,23 +90,23 @@ def test_predicted_mask_lacks_the_pixels_of_detected_objects_of_its_class(end: i
     predicted = box((10, 50), (18, 38)) if is_visible else box((10, 50), (19, 39))
     other = box((0, 60), (end, 60))
     missed = track_of(predicted, missed=True)
-    visible, _ = visible_masks([missed, track_of(other)], {}, ALL_MEASURED)
+    visible, _ = result_masks([missed, track_of(other)], {}, ALL_MEASURED)
     assert torch.equal(visible, predicted & ~other if is_visible else torch.zeros_like(predicted))
     # Objects of other classes do not hide it.
-    assert torch.equal(visible_masks([missed, track_of(other, CHAIR)], {}, ALL_MEASURED)[0], predicted)
+    assert torch.equal(result_masks([missed, track_of(other, CHAIR)], {}, ALL_MEASURED)[0], predicted)
 
 
 def test_invisible_track_has_no_pixels_even_if_its_mask_was_refined() -> None:
     mask = box((10, 50), (20, 40))
     missed = track_of(mask, missed=True)
     missed.is_shown = False
-    (visible,) = visible_masks([missed], {missed: refined(mask)}, ALL_MEASURED)
+    (visible,) = result_masks([missed], {missed: refined(mask)}, ALL_MEASURED)
     assert visible.shape == (HEIGHT, WIDTH) and not visible.any()
 
 
 def test_masks_of_the_tracks_are_not_changed() -> None:
     masks = box((10, 50), (20, 40)), box((10, 50), (30, 60))
     tracks = [track_of(mask.clone()) for mask in masks]
-    visible_masks(tracks, {tracks[0]: refined(masks[0])}, ALL_MEASURED)
+    result_masks(tracks, {tracks[0]: refined(masks[0])}, ALL_MEASURED)
     for track, mask in zip(tracks, masks, strict=True):
         assert np.array_equal(track.mask.numpy(), mask.numpy())
