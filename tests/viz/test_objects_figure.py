@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 
 import torch
@@ -28,8 +29,13 @@ def object_at(stamp: float, number: int, x: float, state: MotionState) -> Tracke
     return TrackedObject(number, 0, MASK, motion, (), 0, torch.nan, state, False, CUBE + position.float())
 
 
-def table_of(*objects: tuple[int, MotionState], frames: int = 8, spacing: float = 1.0) -> ObjectTable:
-    """Return a table in which each object stands at its number times a spacing, or moves to the right with 1 m/s."""
+def table_of(
+    *objects: tuple[int, MotionState], frames: int = 8, spacing: float = 1.0, measured: int | None = None
+) -> ObjectTable:
+    """Return a table in which each object stands at its number times a spacing, or moves to the right with 1 m/s.
+
+    From the frame ``measured`` on, they have no points.
+    """
     table, image = ObjectTable(), torch.zeros(3, 2, 2, dtype=torch.uint8)
     for index in range(frames):
         stamp = index / 10
@@ -37,6 +43,8 @@ def table_of(*objects: tuple[int, MotionState], frames: int = 8, spacing: float 
             object_at(stamp, n, spacing * n + (stamp if state is MotionState.DYNAMIC else 0), state)
             for n, state in objects
         ]
+        if measured is not None and index >= measured:
+            shown = [replace(each, cloud=each.cloud[:0]) for each in shown]
         table.append_objects(
             RGBDFrame(index, stamp, image, torch.ones(1, 2, 2)), FrameObjects(shown, MASK, MASK, []), UP
         )
@@ -79,7 +87,7 @@ def test_names_of_objects_at_the_same_place_do_not_overlap() -> None:
 def test_objects_of_few_frames_are_not_drawn() -> None:
     table = table_of((1, MotionState.STATIC), frames=4)
     assert draw(table) == []
-    assert draw_axes(table).get_xlabel() == "x [m]\nnot drawn: 1 that were seen in fewer than 5 frames"
+    assert draw_axes(table).get_xlabel() == "x [m]\nnot drawn: 1 that were measured in fewer than 5 frames"
 
 
 def test_objects_without_a_name_are_counted() -> None:
@@ -120,3 +128,10 @@ def test_outline_encloses_the_cube_from_above() -> None:
     assert outline.shape == (5, 2)
     torch.testing.assert_close(torch.from_numpy(outline.min(axis=0)), torch.tensor([2.75, -2.25]).double())
     torch.testing.assert_close(torch.from_numpy(outline.max(axis=0)), torch.tensor([3.25, -1.75]).double())
+
+
+def test_object_that_was_measured_in_few_frames_is_not_drawn_but_counted() -> None:
+    assert len(draw(table_of((1, MotionState.STATIC), measured=5))) == 1
+    axes = draw_axes(table_of((1, MotionState.STATIC), measured=4))
+    assert not axes.texts
+    assert axes.get_xlabel() == "x [m]\nnot drawn: 1 that were measured in fewer than 5 frames"

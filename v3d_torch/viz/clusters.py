@@ -114,7 +114,7 @@ def _set_views(panels: Sequence[Axes3D], points: Tensor) -> None:
     """Set the same view for all panels, with equal scales, that contains all points."""
     low, high = (points.amin(dim=0) - _BORDER).tolist(), (points.amax(dim=0) + _BORDER).tolist()
     for axes in panels:
-        axes.set(xlabel="x [m]", ylabel="z (depth) [m]", zlabel="-y (up) [m]")
+        axes.set(xlabel="x [m]", ylabel="z (depth) [m]", zlabel="-y [m]")
         axes.set(xlim=(low[0], high[0]), ylim=(low[2], high[2]), zlim=(-high[1], -low[1]))
         axes.set_aspect("equal", adjustable="box")
         axes.set_box_aspect(None, zoom=1.05)

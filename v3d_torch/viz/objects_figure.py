@@ -88,7 +88,7 @@ def _axis_label(omitted: int, unnamed: int) -> str:
     """Return the label of the x axis, and below it the numbers of objects that are not drawn or have no name."""
     notes = []
     if omitted:
-        notes.append(f"not drawn: {omitted} that were seen in fewer than {_MIN_FRAMES} frames")
+        notes.append(f"not drawn: {omitted} that were measured in fewer than {_MIN_FRAMES} frames")
     if unnamed:
         notes.append(f"without a name: {unnamed}")
     return f"x [m]\n{'; '.join(notes)}" if notes else "x [m]"
@@ -99,7 +99,8 @@ def _rows_of_objects(objects: ObjectTable) -> tuple[dict[int, Tensor], int]:
     order = objects["id"].argsort(stable=True)
     ids, counts = objects["id"][order].unique_consecutive(return_counts=True)
     rows = dict(zip(ids.tolist(), order.split(counts.tolist()), strict=True))
-    drawn = {number: own for number, own in rows.items() if len(own) >= _MIN_FRAMES}
+    is_measured = objects["box"][:, 0].isfinite()
+    drawn = {number: own for number, own in rows.items() if is_measured[own].sum() >= _MIN_FRAMES}
     return drawn, len(rows) - len(drawn)
 
 
@@ -118,10 +119,7 @@ def _draw_object(axes: Axes, objects: ObjectTable, rows: Tensor, R_lw: Tensor, *
     segments = [centroid[first : first + 2] for first in seen]
     axes.add_collection(LineCollection(segments, colors=[colours[first + 1] for first in seen], linewidths=1.5))
     box = objects["box"][rows]
-    known = box[:, 0].isfinite().nonzero()[:, 0]
-    if not len(known):
-        return
-    last = int(known[-1])
+    last = int(box[:, 0].isfinite().nonzero()[-1])
     outline = box_outline(box[last], R_lw)
     axes.plot(*outline.T, color=colours[last], linewidth=1.0)
     if with_name:

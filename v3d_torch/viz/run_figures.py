@@ -66,7 +66,8 @@ def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot, title: str) 
         votes = f": {obj.votes} {'vote' if obj.votes == 1 else 'votes'}" if obj.votes else ""
         objects[obj.id] = (mask, f"{label}{votes}", motion_state)
         centroid = T_cw[:3, :3] @ obj.centroid + T_cw[:3, 3]
-        if mask.any() and centroid[2] > 0:  # in view and in front of the camera; false for NaN, an unknown centroid
+        # Without points the centroid is a prediction; that of an object that was never measured is NaN.
+        if mask.any() and len(obj.cloud) and centroid[2] > 0:
             centres[obj.id] = camera.distort(camera.project(centroid[None]))[0]
     save_voting_figure(snapshot.frame.image, objects, centres, snapshot.result.vote_pairs, path, title)
 
