@@ -152,6 +152,7 @@ class V3DSLAM(FramePreprocessor):
         self.up_estimator = UpEstimator()
         self._replace_configured(config, camera)
         self._previous: TrackedFrame | None = None
+        self._last_segmented_tracked: int | None = None  # index; preprocessing can be some frames ahead
         self.predictions = deque([self._predict()] * PREFETCHED_FRAMES)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -359,7 +360,12 @@ class V3DSLAM(FramePreprocessor):
         Raises:
             ConfigError: If a stage was replaced by one without state_dict.
         """
-        own = {"previous": self._previous, "predictions": list(self.predictions), "segmenter": self._segmenter_state}
+        own = {
+            "previous": self._previous,
+            "predictions": list(self.predictions),
+            "segmenter": self._segmenter_state,
+            "last_segmented": self._last_segmented_tracked,
+        }
         return {**{name: each.state_dict() for name, each in self._components_with_state().items()}, **own}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -378,6 +384,7 @@ class V3DSLAM(FramePreprocessor):
         for name, component in self._components_with_state().items():
             component.load_state_dict(state[name])
         self._previous, self._segmenter_state = state["previous"], state["segmenter"]
+        self._last_segmented = self._last_segmented_tracked = state["last_segmented"]
         self.predictions = deque(state["predictions"])
         restore_segmenter(self.segment, self._segmenter_state)
 
@@ -411,6 +418,8 @@ class V3DSLAM(FramePreprocessor):
         """
         segmentation = preprocessed.segmentation
         self._segmenter_state = segmentation.segmenter_state
+        if segmentation.instances is not None:
+            self._last_segmented_tracked = preprocessed.frame.index
         self.up_estimator.votes = up_votes(segmentation.segmenter_state)
         self.timer.add(segmentation.times)
         return segmentation
@@ -453,7 +462,7 @@ class V3DSLAM(FramePreprocessor):
         if is_other_part:  # the pose relative to the stored views is a guess
             self.free_space_check.drop_views()
             self.classify_motion.drop_views()
-        if pose.status is not TrackingStatus.LOST:
+        if pose.status is not TrackingStatus.LOST or self.poses.is_localised:  # also the pose that starts the map
             self.classify_motion.move_to_map(invert(pose.T_cw) @ guessed_T_cw, all_tracks=is_other_part)
 
     def _predict(self) -> PosePrediction | None:

@@ -543,3 +543,8 @@ def test_zero_seeds_or_workers_are_rejected(option: str, moment: Path, tmp_path:
 
 def test_help_names_the_options() -> None:
     assert "--ray" in call("--help").stdout
+
+
+def test_number_of_seeds_has_a_limit(moment: Path, tmp_path: Path) -> None:
+    result = call("--seqs", moment, "--seeds", "99999999999", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and "--seeds" in result.stderr and not (tmp_path / "out").exists()

@@ -348,6 +348,20 @@ def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
         read_run(copy / "map.ply")
 
 
+def shift_stamps(path: Path, seconds: float) -> None:
+    table = pq.read_table(path)
+    stamps = [stamp + seconds for stamp in table["stamp"].to_pylist()]
+    pq.write_table(table.set_column(table.column_names.index("stamp"), "stamp", [stamps]), path)
+
+
+def drop_row(path: Path) -> None:
+    pq.write_table(pq.read_table(path)[1:], path)
+
+
+def with_frames(path: Path, count: int) -> None:
+    path.write_text(json.dumps({**json.loads(path.read_text()), "frames": count}))
+
+
 @pytest.mark.usefixtures("without_plots")
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
@@ -358,6 +372,10 @@ def test_file_of_a_run_is_an_error_that_suggests_its_folder(copy: Path) -> None:
         ("trajectory.txt", lambda path: path.write_text("1 2 3\n"), r"trajectory\.txt: line 1"),
         ("trajectory.txt", lambda path: path.write_text("1 0 0 0 0 0 0 1\n"), "belong to different runs"),
         ("objects.parquet", halve, r"objects\.parquet: is not a parquet table"),
+        ("objects.parquet", lambda path: shift_stamps(path, 0.05), r"objects\.parquet and .* different runs"),
+        ("frames.parquet", lambda path: shift_stamps(path, 0.05), r"frames\.parquet and .* different runs"),
+        ("frames.parquet", lambda path: drop_row(path), r"frames\.parquet and .* different runs"),
+        ("metrics.json", lambda path: with_frames(path, -5), r"metrics\.json: frames: input should be greater"),
         (
             "frames.parquet",
             lambda path: pq.write_table(pq.read_table(path).drop(["stamp"]), path),

@@ -387,6 +387,14 @@ def test_unsuitable_result_folder_leaves_no_recording(file: str, words: str, seq
     assert not (tmp_path / "run.rrd").exists()
 
 
+def test_folder_of_the_sequence_is_no_folder_of_results(sequence: Path, tmp_path: Path) -> None:
+    before = files_in(sequence)
+    (tmp_path / "link").symlink_to(sequence)
+    done = call_here("--seq", sequence, "--segmenter", "none", "--out", "link", cwd=tmp_path)
+    assert_error_line(done, "link: is the folder of the sequence; choose another folder with --out")
+    assert files_in(sequence) == before
+
+
 @pytest.mark.parametrize(("table", "words"), [("runs.parquet", "a batch"), ("ablation.csv", "an ablation study")])
 def test_run_does_not_replace_a_run_of_a_batch(table: str, words: str, sequence: Path, tmp_path: Path) -> None:
     """The tables of the batch would keep the values of the run that is gone, and --resume could accept the new one."""

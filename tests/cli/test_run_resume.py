@@ -24,7 +24,6 @@ from typer.testing import Result
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.run_job import run_job
 from v3d_torch.cli import run, run_command
-from v3d_torch.cli.run_summary import way_to_resume
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import load_sequence
@@ -34,11 +33,12 @@ from v3d_torch.io.state_file import VERSION
 from v3d_torch.mapping.map_io import load_map, save_map
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.pipeline import ViewerGroup
-from v3d_torch.runs import results
+from v3d_torch.runs import results, run_summary
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import RunRequest, read_request
 from v3d_torch.runs.result_folder import lock_results
+from v3d_torch.runs.run_summary import way_to_resume
 from v3d_torch.runs.stored_run import read_run
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -311,7 +311,7 @@ def test_run_whose_map_file_cannot_be_written_keeps_its_results_and_resumes(
     sequence: Path, whole_run: Path, tmp_path: Path, options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     differences: list[str | None] = []
-    monkeypatch.setattr(run_command, "make_paper_table", lambda _, __, difference: differences.append(difference))
+    monkeypatch.setattr(run_summary, "make_paper_table", lambda _, __, difference: differences.append(difference))
     out, room = tmp_path / "out", tmp_path / "maps" / "room.map"
 
     def remove_folder() -> None:
@@ -415,6 +415,11 @@ def test_finished_run_has_nothing_to_resume(whole_run: Path) -> None:
     done = call("--resume", whole_run)
     assert (done.exit_code, done.stdout) == (0, f"{whole_run}: the run is finished; nothing to resume\n")
     assert {path: path.stat().st_mtime_ns for path in whole_run.rglob("*")} == before
+
+
+@pytest.mark.parametrize("option", [("--seed", "5"), ("--config", "paper"), ("--save-map", "room.npz"), ("--fps", "9")])
+def test_option_that_a_finished_run_did_not_have_is_rejected(whole_run: Path, option: tuple[str, str]) -> None:
+    assert_error_line(call("--resume", whole_run, *option), f"{option[0]}", f"conflicts with the run in {whole_run}")
 
 
 def test_missing_checkpoint_is_rejected_with_a_suggestion(tmp_path: Path) -> None:

@@ -163,6 +163,8 @@ GOOD = "# header\n1 0 0 0 0 0 0 1\n"
         (GOOD + "2 0 0 0 0 0 0\n", "line 3"),
         (GOOD + "2 0 0 0 0 0 0 1 9\n", "line 3"),
         (GOOD + "2 0 0 zero 0 0 0 1\n", "line 3"),
+        (GOOD + "1_0 0 0 0 0 0 0 1\n", "line 3"),
+        (GOOD + "2 0 0 \u0661 0 0 0 1\n", "line 3"),
         (GOOD + "\n2 0 0 nan 0 0 0 1\n", "line 4 has a number that is not finite"),
         (GOOD + "inf 0 0 0 0 0 0 1\n", "line 3 has a number that is not finite"),
         (GOOD + "2 0 0 0 0 0 0 0\n3 0 0 0 0 0 0 0\n", "line 3 has a quaternion that is zero"),

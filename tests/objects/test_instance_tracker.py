@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
-from v3d_torch.objects.track import Track, predict_clouds
+from v3d_torch.objects.track import Detection3D, Track, predict_clouds
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import Instances
 
@@ -290,10 +291,10 @@ def test_predicted_cloud_moves_like_the_predicted_state() -> None:
 def test_cloud_of_the_last_detection_moves_with_the_object() -> None:
     track_boards = BoardTracker()
     (track,) = track_boards(Board(-0.5))
-    assert track.earlier_cloud() is None
+    assert track.predict_previous_cloud() is None
     for frame in range(1, 20):
         track_boards(Board(-0.5 + 0.03 * frame))
-    cloud = track.earlier_cloud()
+    cloud = track.predict_previous_cloud()
     assert cloud is not None
     assert float((cloud.mean(dim=0) - track.newest.cloud.mean(dim=0)).norm()) < 0.01
 
@@ -806,3 +807,26 @@ def test_object_detected_again_is_shown() -> None:
     for frame in range(40):
         (track,) = track_boards(Board(-0.6 + 0.03 * frame, detected=not 20 <= frame < 32))
         assert track.is_shown is (frame < 23 or frame >= 32)
+
+
+def test_what_the_first_frame_shows_moves_to_the_map_in_which_the_camera_is_found() -> None:
+    track_boards, offset = BoardTracker(), HERE.clone()
+    offset[0, 3] = 3.0
+    track_boards.tracker.start_guessed_world(0.0)
+    depth, instances = render([Board(0.0)], HERE)
+    (track,) = track_boards.track(depth, instances, 0.0, T_wc=HERE)
+    track_boards.tracker.move_to_map(offset)
+    (moved,) = track_boards.track(depth, instances, 1 / 30, T_wc=offset)
+    assert moved is track and float(track.detections[0].centroid[0]) == pytest.approx(3.0, abs=0.01)
+    assert float(track.velocity.norm()) < 0.05
+
+
+@pytest.mark.parametrize("stamp", [-1e6, -10.0, 0.0, 1.7e9])
+def test_object_without_a_centroid_has_no_state_at_any_time(stamp: float) -> None:
+    mask = torch.zeros(4, 4, dtype=torch.bool)
+    track = Track(1, stamp, TrackerConfig(), mask, mask, torch.zeros(2, dtype=torch.uint8))
+    unknown = torch.full((3,), torch.nan, dtype=torch.float64)
+    track.update_label(PERSON, 1.0)
+    track.add_detection(Detection3D(stamp, unknown, torch.zeros(0, 3)))
+    for state in (track.predict_state(stamp + 2), track.predict_unobserved_state(stamp + 2)):
+        assert state.stamp == stamp + 2 and not state.is_known and state.variances == (1.0, 0.0, 1.0)

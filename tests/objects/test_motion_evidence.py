@@ -19,7 +19,7 @@ STRIDE = 4
 
 
 @pytest.mark.parametrize(("label", "fewest"), [(PERSON, FreeSpaceConfig().min_points), (UNLABELLED, 9)])
-def test_object_has_appeared_only_if_enough_of_its_pixels_are_known(label: int, fewest: int) -> None:
+def test_object_has_mostly_appeared_only_if_enough_of_its_pixels_are_known(label: int, fewest: int) -> None:
     """A region without a class consists of new pixels, so that fewer of them are enough."""
     view = DepthView(0.0, torch.full((1, 120, 160), 3.0), torch.eye(4, dtype=torch.float64))
     appeared = AppearedPixels(torch.ones(1, 30, 40, dtype=torch.float64), STRIDE)
@@ -29,4 +29,4 @@ def test_object_has_appeared_only_if_enough_of_its_pixels_are_known(label: int, 
         track = Track(1, 0.0, TrackerConfig(), mask, mask, pack_masks(mask))
         track.update_label(label, 0.0)
         evidence = free_space_evidence([track], {}, view, appeared, FreeSpaceConfig(), CAMERA)
-        assert evidence.has_appeared(track) is (count == fewest)
+        assert evidence.has_mostly_appeared(track) is (count == fewest)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from helpers.two_views import CAMERA, two_views
 
@@ -88,3 +90,13 @@ def test_no_motion_without_depth_or_matches() -> None:
     without_depth = Features(a.uv, a.pixel, torch.zeros_like(a.depth), a.octave, a.descriptors)
     assert estimate(without_depth, b) is None
     assert estimate(a, b[:5]) is None
+
+
+def test_place_whose_depth_is_of_another_scale_is_not_recognised() -> None:
+    """As with a wrong depth scale in a known map. The motion since the previous frame does not depend on this depth."""
+    a, b, T_ba = two_views()
+    estimate = MotionEstimator(Config().odometry, Config().features, CAMERA, seed=0)
+    for factor, is_recognised in ((0.5, False), (0.8, False), (0.9, True), (1.1, True), (1.3, False), (0.0, True)):
+        scaled = replace(b, depth=factor * b.depth)
+        assert (estimate(a, scaled) is not None) is is_recognised, factor
+        assert estimate(a, scaled, initial_guess=T_ba) is not None

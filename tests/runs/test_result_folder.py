@@ -12,9 +12,11 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
+from v3d_torch.config import Config
 from v3d_torch.errors import OutputError
 from v3d_torch.runs import file_names, result_folder
 from v3d_torch.runs.file_names import RunFile
+from v3d_torch.runs.request import RunRequest, write_request
 
 
 def test_runs_started_in_the_same_second_have_separate_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,3 +100,15 @@ def test_names_of_result_files_are_written_once() -> None:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         names = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)} & set(RunFile)
         assert path == source or not names, path
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_masks_of_the_user_are_no_earlier_results(tmp_path: Path, saved: bool) -> None:
+    """An earlier run in the folder wrote no masks; then the user put masks there."""
+    write_request(tmp_path, RunRequest("demo", Config(), save_masks=saved))
+    (tmp_path / "masks").mkdir()
+    for name in ("run.log", "metrics.json", "masks/1.png"):
+        (tmp_path / name).write_text("")
+    result_folder.clear_earlier_results(tmp_path)
+    assert (tmp_path / "masks" / "1.png").exists() is not saved
+    assert not (tmp_path / "metrics.json").exists()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -163,3 +163,15 @@ def test_instances_without_pixels_are_left_out() -> None:
 def test_parameter_of_wrong_type_is_rejected(parameters: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         V3DSLAM(**{"camera": CAMERA, "segment": NoSegmentation(), **parameters})
+
+
+@pytest.mark.parametrize("indices", [range(0, 12), range(1, 25, 2), [3, 3, 3], [0, 1, 4, 5, 6, 11]])
+def test_one_of_two_frames_is_segmented_whatever_their_indices(indices: Sequence[int]) -> None:
+    """A source can leave out frames, and begin with any index."""
+    slam = V3DSLAM(CAMERA, lambda _: INSTANCES, load_config(overrides=["segmentation.interval=2"]))
+    due = [slam.segment_instances(replace(FRAME, index=index), None).instances is not None for index in indices]
+    last, expected = None, []
+    for index in indices:
+        expected.append(last is None or index - last >= 2 or index == last)
+        last = index if expected[-1] else last
+    assert due == expected and due[0]

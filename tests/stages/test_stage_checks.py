@@ -88,7 +88,7 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
     (
         "free_space_check",
         lambda result: result.was_free,
-        "free_space_check returned a Tensor; it must return New",
+        "free_space_check returned a Tensor; it must return App",
     ),
     ("propose_unlabelled", lambda _: [], "propose_unlabelled returned a list; it must return Instances"),
     ("propose_unlabelled", change(masks=lambda x: x[..., 1:]), r"propose_unlabelled\.masks .* shape \(N, 48, 64\)"),

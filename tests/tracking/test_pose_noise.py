@@ -17,14 +17,16 @@ def ids(*values: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("factor", [1.0, 4.0])
-def test_noise_of_a_smooth_motion_is_measured(factor: float) -> None:
-    """The camera swings; its poses have ``factor`` times the nominal standard deviation."""
+@pytest.mark.parametrize("rate", [60, 30, 10, 7])
+def test_noise_of_a_smooth_motion_is_measured(factor: float, rate: int) -> None:
+    """The camera swings within some seconds; its poses have ``factor`` times the nominal standard deviation."""
     generator = torch.Generator().manual_seed(0)
     amplitude = torch.tensor([0.2, 0.1, 0.1, 0.2, 0.3, 0.1], dtype=torch.float64)
     noise = PoseNoise()
     for n in range(300):
         error = factor * NOMINAL.sqrt() @ torch.randn(6, dtype=torch.float64, generator=generator)
-        noise.update(n / 30, se3_exp(amplitude * torch.sin(torch.tensor(n / 15.0))) @ se3_exp(error), NOMINAL)
+        swing = torch.sin(torch.tensor(min(30 / rate, 1.0) * n / 15))
+        noise.update(n / rate, se3_exp(amplitude * swing) @ se3_exp(error), NOMINAL)
     ratios = (noise.scale(NOMINAL, 1.0)[0] / NOMINAL).diagonal()
     assert 0.6 * factor**2 < ratios.min() and ratios.max() < 1.7 * factor**2
 
@@ -53,8 +55,8 @@ def test_windows_over_interruptions_do_not_count() -> None:
         noise.update(n / 30, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
     for n in range(40):  # one frame a second
         noise.update(10.0 + n, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
-    for n in range(40):  # five frames last for 0.4 s
-        noise.update(100.0 + n / 10, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
+    for n in range(40):  # five frames last for 0.67 s
+        noise.update(100.0 + n / 6, se3_exp(torch.full((6,), 0.5 * (n % 2), dtype=torch.float64)), NOMINAL)
     assert torch.equal(noise.scale(NOMINAL, 1.0)[0], before)
 
 

@@ -158,3 +158,20 @@ def test_frame_inherits_the_variance_of_all_frames_of_odometry_before_a_keyframe
     camera(frame_pose(EYE, TrackingStatus.ODOMETRY), new=keyframe(), keyframes=2)
     with_first, with_second = (camera(tracked(), owners=(owner,)).covariance for owner in (0, 1))
     torch.testing.assert_close(with_second / (1 + 3), with_first / (1 + 1))
+
+
+@pytest.mark.parametrize("gap", [1.0, 3.0, 4.0, 5.0])
+def test_twist_after_a_gap_is_that_of_the_camera(gap: float) -> None:
+    """The camera turned by 1 rad/s before the gap, and stands still in it and afterwards."""
+    rate = torch.tensor([0.0, 0, 0, 0, 1.0, 0], dtype=torch.float64)
+    camera, poses, no_matches = StateEstimator(), PoseHistory(), torch.zeros(0, 2, dtype=torch.int64)
+    ids = torch.zeros(0, dtype=torch.int64)
+    for n in range(30):
+        turning = CameraMotion(se3_exp(-rate / 30), -rate, no_matches, is_measured=True)
+        pose = tracked(se3_exp(-rate * n / 30))
+        poses.append(n / 30, pose, turning, None, None)
+        camera(pose, turning, poses, ids, None)
+    at_rest = CameraMotion(EYE, REST, no_matches, is_measured=True)
+    poses.append(29 / 30 + gap, pose, at_rest, None, None)
+    twist = camera(pose, at_rest, poses, ids, None).twist
+    assert float(twist.norm()) < 0.35

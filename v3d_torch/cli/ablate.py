@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from v3d_torch.cli.errors import exit_on_error
-from v3d_torch.cli.options import Camera, DataRoot, Fps, make_app
+from v3d_torch.cli.options import MAX_SEEDS, Camera, DataRoot, Fps, make_app
 from v3d_torch.io.paths import expand_user_paths
 from v3d_torch.runtime.imports import quick_imports
 
@@ -32,7 +32,9 @@ def main(
         "baseline,no_voting,no_free_space,no_chamfer,no_prediction,no_appearance,no_unlabelled,not_upright,"
         "global_shutter,paper,full"
     ),
-    seeds: Annotated[int, typer.Option(min=1, help="Number of runs of each variant, with seeds from 0.")] = 3,
+    seeds: Annotated[
+        int, typer.Option(min=1, max=MAX_SEEDS, help="Number of runs of each variant, with seeds from 0.")
+    ] = 3,
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", help="Configuration value for all variants, such as segmentation.model=yolo11n-seg."),

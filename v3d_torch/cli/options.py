@@ -14,6 +14,9 @@ from typer.models import CommandFunctionType, OptionInfo
 from v3d_torch.cli.errors import exit_on_error
 from v3d_torch.errors import InputError
 
+MAX_SEEDS = 1000
+"""Maximum number of seeds: all runs of a batch are planned before the first one."""
+
 _PATHS = (Path, Path | None)
 """Types of options that are paths."""
 
@@ -45,7 +48,8 @@ SkipBroken = Annotated[
     ),
 ]
 Seeds = Annotated[
-    int, typer.Option(min=1, help="Number of runs of each sequence and configuration, with seeds from 0.")
+    int,
+    typer.Option(min=1, max=MAX_SEEDS, help="Number of runs of each sequence and configuration, with seeds from 0."),
 ]
 Resume = Annotated[
     bool, typer.Option("--resume", help="Continue the batch in --out: run only what is missing or has failed.")

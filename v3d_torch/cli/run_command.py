@@ -11,7 +11,6 @@ from pathlib import Path
 from rich.console import Console
 
 from v3d_torch.batch.batch_folder import describe_contents
-from v3d_torch.cli.run_summary import print_summary, way_to_resume
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream
@@ -27,9 +26,10 @@ from v3d_torch.runs.map_file import check_map_path
 from v3d_torch.runs.open_sequences import print_notes
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
-from v3d_torch.runs.request import CHANGEABLE, RunRequest, check_not_moved
+from v3d_torch.runs.request import CHANGEABLE, RunRequest, check_not_moved, read_request
 from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder, remove_empty_folder
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.run_summary import print_summary, way_to_resume
 from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
@@ -145,23 +145,33 @@ def resume_run(folder: Path, given: RunRequest, choice: ConfigChoice, out: Path 
     Raises:
         V3DError: If there is no checkpoint, if the run was live, if an option conflicts with it, or as for `start_run`.
     """
-    if is_finished(folder):
-        print_line(Console(soft_wrap=True), f"{folder}: the run is finished; nothing to resume")
-        return
-    checkpoint = read_checkpoint(folder)
-    request = checkpoint.request
+    checkpoint = None if is_finished(folder) else read_checkpoint(folder)
+    request = _request_of_finished_run(folder) if checkpoint is None else checkpoint.request
     if out is not None and out.resolve() != folder.resolve():
         raise InputError(f"--out {out}: conflicts with the run in {folder}; remove this option")
     if (option := request.conflicting_option(given)) is not None:
         raise InputError(f"{option}: conflicts with the run in {folder}; remove this option")
     if (option := choice.conflict(request.config)) is not None:
         raise ConfigError(f"{option}: conflicts with the run in {folder}; remove this option")
+    if checkpoint is None:
+        print_line(Console(soft_wrap=True), f"{folder}: the run is finished; nothing to resume")
+        return
     if (stage := first_not_given(request.config.stages, choice.load().stages)) is not None:
         raise ConfigError(
             f"{folder}: its run imported code, {stage}; give --set {stage} again if it is to be imported, too"
         )
     changed = {name: value for name in CHANGEABLE if (value := getattr(given, name))}
     _run(replace(request, **changed), folder, checkpoint, display)
+
+
+def _request_of_finished_run(folder: Path) -> RunRequest:
+    """Read the options and the configuration with which a run was started.
+
+    Raises:
+        InputError: If the file of its options is missing or damaged.
+        ConfigError: If that of its configuration is.
+    """
+    return replace(read_request(folder), config=load_config(folder / RunFile.CONFIG))
 
 
 @dataclass(frozen=True)
@@ -221,6 +231,8 @@ def _check_outputs(request: RunRequest, out: Path | None, display: Display, *, i
         _check_map_path(Path(request.save_map), out, display)
     if out is None:
         return False
+    if Path(request.seq).is_dir() and os.path.realpath(out) == os.path.realpath(request.seq):
+        raise OutputError(f"{out}: is the folder of the sequence; choose another folder with --out")
     check_unlocked(out)
     return _check_contents(out, _path(request.masks), is_resumed=is_resumed)
 

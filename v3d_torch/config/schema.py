@@ -61,7 +61,8 @@ class DepthConfig(Section):
     sigma: float = Field(1.0, gt=0)
     """Standard deviation of the Gaussian, pixels (authors' code)."""
     edge_ratio: float = Field(0.05, gt=0)
-    """Neighbours whose depth differs from the centre by a larger ratio lie behind an edge and are not averaged."""
+    """Depth is averaged along rows, then along columns. A neighbour whose depth differs by a larger ratio lies behind
+    an edge and is not averaged."""
 
 
 class CloudConfig(Section):

@@ -20,4 +20,6 @@ def parse_number(word: str) -> float:
     Raises:
         ValueError: If the word is not a number.
     """
+    if "_" in word or not word.isascii():  # Python's own numbers
+        raise ValueError(f"{word} is not a number")
     return float("nan") if _WINDOWS_NON_FINITE.fullmatch(word) else float(word)

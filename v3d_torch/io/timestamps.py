@@ -6,6 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from v3d_torch.io.numbers import parse_number
+
 MIN_NANOSECONDS = 1e18
 """Smallest number that is taken for nanoseconds since 1970."""
 
@@ -28,7 +30,7 @@ def parse_timestamp(text: str) -> float:
     Raises:
         ValueError: If the text is not a number.
     """
-    value = float(text)
+    value = parse_number(text)
     return next((value / units for min_value, units in _UNITS_SINCE_1970 if value >= min_value), value)
 
 

@@ -179,14 +179,13 @@ class InstanceTracker(torch.nn.Module):
         """Record that the motion of the camera before a frame was not measured.
 
         Detections from now on are not compared with earlier ones, and their world frame is not that of the map until
-        `move_to_map`. Before the first frame there are no detections to compare.
+        `move_to_map`. This holds for the first frame, too, which can be found in a known map.
 
         Args:
             stamp: Timestamp of the frame, seconds.
         """
-        if self.last_stamp == -torch.inf:
-            return
-        self.comparable_since = stamp
+        if self.last_stamp > -torch.inf:  # else there is nothing to compare with
+            self.comparable_since = stamp
         if self._guessed_since is None:
             self._guessed_since = stamp
 

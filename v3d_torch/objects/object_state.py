@@ -63,8 +63,8 @@ class ObjectState:
         Args:
             stamp: Timestamp, not earlier than that of the state, seconds.
         """
-        if stamp == self.stamp:
-            return self
+        if stamp == self.stamp or not self.is_known:
+            return replace(self, stamp=stamp)
         dt, noise = stamp - self.stamp, self.acceleration_noise**2
         pp, pv, vv = self.variances
         pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
@@ -85,6 +85,8 @@ class ObjectState:
             stamp: Timestamp, not earlier than that of the state, seconds.
             time_constant: Time in which the expected velocity decays to 1/e, seconds.
         """
+        if not self.is_known:
+            return replace(self, stamp=stamp)
         dt, (pp, pv, vv) = stamp - self.stamp, self.variances
         decay, noise = math.exp(-dt / time_constant), self.acceleration_noise**2
         reach = time_constant * (1 - decay)

@@ -149,6 +149,7 @@ class Track:
         self._filter = ConstantVelocityKalmanFilter(config)
         self._max_points = 1
         self._shifts: list[tuple[float, FeatureShift]] = []  # by the time of the frame
+        self._has_surface_centroid = False  # the position of the visible part is that of its refined mask
 
     @property
     def newest(self) -> Detection3D:
@@ -283,7 +284,8 @@ class Track:
             surface_centroid: Centroid of the surface in the refined mask, world frame, metres, float64, shape
                 :math:`(3,)`, which becomes the position; None if the mask was not refined.
         """
-        if surface_centroid is not None and self.newest.has_centroid:
+        self._has_surface_centroid = surface_centroid is not None and self.newest.has_centroid
+        if surface_centroid is not None and self._has_surface_centroid:
             self._filter.correct_visible_position(surface_centroid)
         state = self._filter.visible_state
         if state.is_known and not (self.history and state.stamp - self.history[-1].stamp < _HISTORY_INTERVAL):
@@ -414,7 +416,7 @@ class Track:
             for detection in self.detections:
                 if detection.stamp >= since:
                     self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
-            if self._filter.visible_state.is_known:  # the refined mask shows the same place as before
+            if self._has_surface_centroid:  # the refined mask shows the same place as before
                 self._filter.correct_visible_position(shown.position)
 
     def _predict(self, state: ObjectState, stamp: float) -> ObjectState:

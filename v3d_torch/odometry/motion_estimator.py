@@ -16,7 +16,7 @@ from v3d_torch.features.matching import match_descriptors
 from v3d_torch.features.pnp_ransac import pnp_ransac
 from v3d_torch.features.scale_pyramid import octaves_of_levels
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import se3_log
+from v3d_torch.geometry.se3 import se3_log, transform_points
 from v3d_torch.types import MIN_INTERVAL
 
 _EPIPOLAR_THRESHOLD = 2.0
@@ -29,6 +29,14 @@ because the depth error of the points adds to the pixel error."""
 
 _MAX_ROTATION_RATE = 6.3
 """Maximum rotation rate of a handheld camera or of a camera on a robot, rad/s: a full turn in a second."""
+
+
+_MAX_DEPTH_RATIO = 1.2
+"""Maximum of the median ratio of measured depth to that of the matched points; its inverse is the minimum. The depth
+noise at 6 m is a tenth of this."""
+
+_MIN_MEASURED = 10
+"""Minimum number of matches with depth for a comparison."""
 
 
 def no_matches() -> Tensor:
@@ -126,7 +134,8 @@ class MotionEstimator:
                 Without a prediction all features of a are matched, because b is expected to observe only few of them.
 
         Returns:
-            None if fewer than ``min_inliers`` matches agree on a motion, or if the motion is not plausible.
+            None if fewer than ``min_inliers`` matches agree on a motion, or if the motion is not plausible; without a
+            prediction also if the depth of b is not that of the points of a.
         """
         config = self._config
         selected = torch.nonzero(a.depth > 0)[:, 0]
@@ -149,8 +158,9 @@ class MotionEstimator:
         pairs = pairs[epipolar]
         if pairs.shape[0] < config.min_inliers:
             return None
+        points = self._camera.back_project(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]])
         pose = pnp_ransac(
-            self._camera.back_project(a.uv[pairs[:, 0]], a.depth[pairs[:, 0]]),
+            points,
             b.uv[pairs[:, 1]],
             self._camera.K,
             initial_guess,
@@ -160,5 +170,23 @@ class MotionEstimator:
         )
         if int(pose.inliers.sum()) < config.min_inliers:
             return None
-        motion = RelativeMotion(pose.T_cw, pairs[pose.inliers], matches=matches)
+        inliers = pairs[pose.inliers]
+        if initial_guess is None and not _agrees_in_depth(pose.T_cw, points[pose.inliers], b.depth[inliers[:, 1]]):
+            return None
+        motion = RelativeMotion(pose.T_cw, inliers, matches=matches)
         return motion if motion.is_plausible(elapsed, config.max_speed) else None
+
+
+def _agrees_in_depth(T_ba: Tensor, points: Tensor, depth: Tensor) -> bool:
+    """Check whether the measured depth in b is that of the matched points: that of a wrong scale or place is not.
+
+    Args:
+        T_ba: Motion, float64, shape (4, 4).
+        points: Points in camera a, metres, float64, shape (K, 3).
+        depth: Depth of their features in b, metres, float64, shape (K,); 0 = no measurement.
+    """
+    measured = depth > 0
+    if int(measured.sum()) < _MIN_MEASURED:
+        return True
+    ratio = float((depth / transform_points(T_ba, points)[:, 2])[measured].median())
+    return 1 / _MAX_DEPTH_RATIO < ratio < _MAX_DEPTH_RATIO

@@ -50,8 +50,8 @@ def diagnose(pipeline: Pipeline, request: RunRequest, evaluation_error: str | No
         return pipeline.record.mask_error or _cause_of_missing_scores(pipeline, evaluation_error)
     if request.load_map is not None:
         return (
-            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place, or"
-            " run without --load-map"
+            f"{request.load_map}: no frame of {request.seq} was localised in this map; pass a map of the same place,"
+            " check the depth_scale, or run without --load-map"
         )
     cause = _cause_of_loss(pipeline, pipeline.record.times.indices)
     return f"{name}: the camera was not found in any of the {count} frames, {cause}"

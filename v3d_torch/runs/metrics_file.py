@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from v3d_torch.config.validation import first_error
 from v3d_torch.errors import InputError
@@ -23,7 +23,7 @@ class Metrics(BaseModel):
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     sequence: str
-    frames: int
+    frames: int = Field(ge=0)
     processed: int
     skipped: int = 0
     status: list[TrackingStatus]

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from v3d_torch.errors import LockedError, OutputError
+from v3d_torch.errors import InputError, LockedError, OutputError
 from v3d_torch.io.names import folder_name
 from v3d_torch.runs.file_names import FIGURES, MAP_MASKS, MASKS, RunFile
+from v3d_torch.runs.request import read_request
 
 _LOCK = ".run.lock"
 """Name of the lock file, which exists while a run or a batch writes."""
@@ -22,8 +23,11 @@ _LOCK = ".run.lock"
 _NO_LOCKS = (ENOLCK, ENOSYS, EOPNOTSUPP)
 """Error numbers of file systems without locks."""
 
-_RESULTS = (*(file.value for file in RunFile if file is not RunFile.LOG), f"{MASKS}/*.png", f"{MAP_MASKS}/*.png")
-"""Patterns of the files that a run, or the report of a run, writes in addition to the log."""
+_FILES = tuple(file.value for file in RunFile if file is not RunFile.LOG)
+"""Names of the files that a run, or the report of a run, writes in addition to the log."""
+
+_IMAGES = (f"{MASKS}/*.png", f"{MAP_MASKS}/*.png")
+"""Patterns of the images that a run with ``--save-masks`` writes."""
 
 _SUBFOLDERS = (FIGURES, MASKS, MAP_MASKS)
 """Folders of images."""
@@ -140,10 +144,19 @@ def find_earlier_results(folder: Path) -> list[Path]:
         OutputError: If the folder has files with the names of results but no log of a run: they can be the user's own,
             such as a ground truth.
     """
-    earlier = [path for pattern in (*_RESULTS, *_UNFINISHED) for path in sorted(folder.glob(pattern))]
+    patterns = (*_FILES, *(_IMAGES if _has_saved_masks(folder) else ()), *_UNFINISHED)
+    earlier = [path for pattern in patterns for path in sorted(folder.glob(pattern))]
     if earlier and not (folder / RunFile.LOG).is_file():
         raise OutputError(f"{earlier[0]}: exists and was not written by a run; choose another folder with --out")
     return earlier
+
+
+def _has_saved_masks(folder: Path) -> bool:
+    """Check whether the earlier run in a folder saved masks: otherwise images there are those of the user."""
+    try:
+        return read_request(folder).save_masks
+    except InputError:  # missing, or of another version
+        return (folder / RunFile.LOG).is_file()
 
 
 def is_result(path: Path, folder: Path) -> bool:
@@ -152,7 +165,9 @@ def is_result(path: Path, folder: Path) -> bool:
     if not path.is_relative_to(folder):
         return False
     name = path.relative_to(folder).as_posix()
-    return any(fnmatchcase(name, pattern) for pattern in (*_RESULTS, *_UNFINISHED, *_SUBFOLDERS, _LOCK, RunFile.LOG))
+    return any(
+        fnmatchcase(name, pattern) for pattern in (*_FILES, *_IMAGES, *_UNFINISHED, *_SUBFOLDERS, _LOCK, RunFile.LOG)
+    )
 
 
 def clear_earlier_results(folder: Path) -> None:

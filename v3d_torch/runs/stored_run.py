@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import torch
+from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
@@ -90,6 +92,14 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         except InputError as error:
             if groundtruth is not None:
                 raise InputError(f"{groundtruth}: {error}") from error
+    tables = {
+        RunFile.FRAMES: _read_table(folder / RunFile.FRAMES, ("frame", "stamp", "status", "keyframe")),
+        RunFile.OBJECTS: _read_table(
+            folder / RunFile.OBJECTS, ("frame", "stamp", "id", "class", "votes", "chamfer", "motion_state", "missed")
+        ),
+    }
+    if trajectory is not None and metrics.failure is None:
+        _check_stamps(folder, trajectory.stamps, tables)
     return StoredRun(
         folder=folder,
         metrics=metrics,
@@ -97,13 +107,29 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
         keyframes=_read_poses(folder / RunFile.KEYFRAMES),
         groundtruth=truth,
         evaluation=evaluation,
-        frames=_read_table(folder / RunFile.FRAMES, ("frame", "stamp", "status", "keyframe")),
-        objects=_read_table(
-            folder / RunFile.OBJECTS, ("frame", "stamp", "id", "class", "votes", "chamfer", "motion_state", "missed")
-        ),
+        frames=tables[RunFile.FRAMES],
+        objects=tables[RunFile.OBJECTS],
         config_text=config_text,
         config=_read_config(config_path),
     )
+
+
+def _check_stamps(folder: Path, stamps: Tensor, tables: Mapping[RunFile, pa.Table | None]) -> None:
+    """Check that the tables of a run have the timestamps of its trajectory: one row for each frame, or for each object.
+
+    Raises:
+        InputError: If a table is from another run.
+    """
+    known = {f"{stamp:.6f}" for stamp in stamps.tolist()}  # the precision of trajectory files
+    for file, table in tables.items():
+        if table is None:
+            continue
+        found = {f"{stamp:.6f}" for stamp in table["stamp"].to_pylist()}
+        if not found <= known or (file is RunFile.FRAMES and len(table) != len(stamps)):
+            raise InputError(
+                f"{folder}: {file} and trajectory.txt have other timestamps, so they belong to different runs; run the"
+                " sequence again"
+            )
 
 
 def _read_poses(path: Path) -> Trajectory | None:

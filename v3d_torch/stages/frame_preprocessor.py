@@ -60,6 +60,7 @@ class FramePreprocessor(ReplaceableStages):
             config.depth.kernel_size, config.depth.sigma, config.depth.edge_ratio
         )
         self.detect_features: FeatureStage = ORB(config.features, camera)
+        self._last_segmented: int | None = None  # index of the frame
 
     def preprocess(self, frame: RGBDFrame, prediction: PosePrediction | None) -> PreprocessedFrame:
         """Check and segment a frame, re-estimate its depth, and detect its features.
@@ -97,13 +98,17 @@ class FramePreprocessor(ReplaceableStages):
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
             prediction: Pose prediction after an earlier frame, from which the segmenter computes the roll of the
                 camera; None if the pose is not known.
-            is_due: False to skip the frame; None to segment only every ``segmentation.interval``-th frame.
+            is_due: False to skip the frame; None to segment the first frame, and then one of ``segmentation.interval``
+                frames.
 
         Raises:
             ConfigError: If the segmenter did not return valid `Instances`.
         """
         if is_due is None:
-            is_due = frame.index % self.config.segmentation.interval == 0
+            last = self._last_segmented
+            is_due = last is None or not 0 < frame.index - last < self.config.segmentation.interval
+        if is_due:
+            self._last_segmented = frame.index
         timer = StageTimer()
         with timer("segmentation"):
             instances = None

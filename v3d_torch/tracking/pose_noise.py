@@ -22,8 +22,9 @@ from v3d_torch.runtime.stateful import StatefulComponent
 _WINDOW = 5
 """Number of consecutive poses, of which the middle one is compared with the interpolation of the others."""
 
-_MAX_DURATION = 0.3
-"""Maximum duration of a window, seconds: within it, a cubic polynomial describes the motion of a handheld camera."""
+_MAX_DURATION = 0.6
+"""Maximum duration of a window, seconds: five poses of a camera that tracks seven frames per second. The longer the
+window, the more of a motion that a cubic polynomial does not describe counts as noise."""
 
 _PRIOR_RATIO = 16.0
 """Ratio of variances that is assumed at the start of a run, when neither the velocity of the camera nor its readout is

@@ -36,6 +36,10 @@ _LOST_FOR_A_SECOND = _covariance(1.0, 1.0)
 """Additional covariance of a camera that is lost for a second although its motion is measured, as after a jump: it can
 be wherever it could move at walking speed."""
 
+_MAX_GAP = 0.5
+"""Time between two frames above which the filter starts again, seconds: a camera at its maximum rotation rate then
+turns by more than half a turn, and the difference from its predicted pose is ambiguous."""
+
 
 class StateEstimator(StatefulComponent):
     """Estimates the state of the camera at each frame.
@@ -140,8 +144,9 @@ class StateEstimator(StatefulComponent):
         return covariance
 
     def _filter_measured(self, stamp: float, T_wc: Tensor, motion: CameraMotion, *, is_continuous: bool) -> None:
-        """Update the filter with a pose; restart it if the pose does not continue a measured one."""
-        if is_continuous and self._last_measured == self._filter.stamp:
+        """Update the filter with a pose; restart it if the pose does not continue a measured one, or after a gap."""
+        is_near = stamp - self._filter.stamp <= _MAX_GAP
+        if is_continuous and is_near and self._last_measured == self._filter.stamp:
             self._filter.predict(stamp)
             self._filter.update(T_wc, self._frame_noise)
         else:
