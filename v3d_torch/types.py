@@ -89,33 +89,8 @@ class RGBDFrame:
                 the camera has no depth scale, or if a time is not a finite number of seconds.
         """
         colour, measured = _array(image), _array(depth)
-        if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
-            raise InputError(
-                f"frame {index}: the colour image is {colour.dtype} of shape {colour.shape}; give uint8 RGB of shape"
-                " (H, W, 3)"
-            )
-        if measured.shape != colour.shape[:2]:
-            raise InputError(
-                f"frame {index}: the depth image has shape {measured.shape}, the colour image {colour.shape}; give"
-                " depth of shape (H, W), registered to the colour image"
-            )
-        if measured.dtype.kind not in "fiu":
-            raise InputError(
-                f"frame {index}: the depth image is {measured.dtype}; give metres in floating point, or whole numbers"
-                " in the camera's units"
-            )
-        for name, seconds in (("stamp", stamp), ("delay", depth_delay)):
-            if not math.isfinite(to_float(seconds)):
-                raise InputError(f"frame {index}: the {name} is {seconds!r}; give seconds, as a finite number")
-        if to_float(stamp) > _MAX_STAMP:
-            raise InputError(f"frame {index}: the stamp is {stamp!r}, in another unit or wrong; give seconds")
-        if not isinstance(camera, PinholeCamera | None):
-            raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
-        if camera is not None and colour.shape[:2] != (camera.height, camera.width):
-            raise InputError(
-                f"frame {index}: has {colour.shape[1]}x{colour.shape[0]} pixels, but the camera"
-                f" {camera.width}x{camera.height}; give the camera that took it"
-            )
+        _check_arrays(index, colour, measured, camera)
+        _check_times(index, stamp, depth_delay)
         scale = camera.depth_scale if camera is not None else None
         if measured.dtype.kind != "f" and scale is None:
             raise InputError(
@@ -134,6 +109,41 @@ class RGBDFrame:
             depth_delay=to_float(depth_delay),
             gravity=None if gravity is None else _unit_vector(_array(gravity), index),
         )
+
+
+def _check_arrays(index: int, colour: NDArray[Any], measured: NDArray[Any], camera: PinholeCamera | None) -> None:
+    """Check that the images of a frame have the right shapes and types, and the size of its camera."""
+    if colour.dtype != np.uint8 or colour.ndim != 3 or colour.shape[2] != 3:
+        raise InputError(
+            f"frame {index}: the colour image is {colour.dtype} of shape {colour.shape}; give uint8 RGB of shape"
+            " (H, W, 3)"
+        )
+    if measured.shape != colour.shape[:2]:
+        raise InputError(
+            f"frame {index}: the depth image has shape {measured.shape}, the colour image {colour.shape}; give"
+            " depth of shape (H, W), registered to the colour image"
+        )
+    if measured.dtype.kind not in "fiu":
+        raise InputError(
+            f"frame {index}: the depth image is {measured.dtype}; give metres in floating point, or whole numbers"
+            " in the camera's units"
+        )
+    if not isinstance(camera, PinholeCamera | None):
+        raise InputError(f"frame {index}: the camera is a {type(camera).__name__}; give a PinholeCamera")
+    if camera is not None and colour.shape[:2] != (camera.height, camera.width):
+        raise InputError(
+            f"frame {index}: has {colour.shape[1]}x{colour.shape[0]} pixels, but the camera"
+            f" {camera.width}x{camera.height}; give the camera that took it"
+        )
+
+
+def _check_times(index: int, stamp: float, depth_delay: float) -> None:
+    """Check that the times of a frame are finite numbers of seconds."""
+    for name, seconds in (("stamp", stamp), ("delay", depth_delay)):
+        if not math.isfinite(to_float(seconds)):
+            raise InputError(f"frame {index}: the {name} is {seconds!r}; give seconds, as a finite number")
+    if to_float(stamp) > _MAX_STAMP:
+        raise InputError(f"frame {index}: the stamp is {stamp!r}, in another unit or wrong; give seconds")
 
 
 def _array(values: object) -> NDArray[Any]:

@@ -103,21 +103,7 @@ def evaluate(
         ConfigError: If ``max_time_difference`` is negative or not a number, if ``rpe_delta`` is not positive, or if
             ``frames`` is negative.
     """
-    for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
-        if not isinstance(value, Trajectory):
-            raise InputError(
-                f"the {name} is a {type(value).__name__}, not a Trajectory; read a file with read_trajectory, or build"
-                " a Trajectory from arrays"
-            )
-    check_masks(is_localised=is_localised)
-    if is_localised is not None and len(is_localised) != len(estimate):
-        raise InputError(
-            f"is_localised has {len(is_localised)} values for {len(estimate)} poses; give one for each pose"
-        )
-    if not max_time_difference >= 0:  # also for NaN
-        raise ConfigError(f"max_time_difference is {max_time_difference}; give a time of at least 0 seconds")
-    if frames is not None and frames < 0:
-        raise ConfigError(f"frames is {frames}; give the number of frames of the sequence")
+    _check_arguments(groundtruth, estimate, max_time_difference, frames, is_localised)
     matches = associate_trajectories(groundtruth, estimate, max_time_difference)
     if len(matches) < MIN_PAIRS:
         raise InputError(
@@ -157,6 +143,31 @@ def evaluate(
         alignment=alignment,
         notes=tuple(notes),
     )
+
+
+def _check_arguments(
+    groundtruth: object,
+    estimate: Trajectory,
+    max_time_difference: float,
+    frames: int | None,
+    is_localised: Tensor | None,
+) -> None:
+    """Check the arguments of `evaluate`."""
+    for name, value in (("ground truth", groundtruth), ("estimate", estimate)):
+        if not isinstance(value, Trajectory):
+            raise InputError(
+                f"the {name} is a {type(value).__name__}, not a Trajectory; read a file with read_trajectory, or build"
+                " a Trajectory from arrays"
+            )
+    check_masks(is_localised=is_localised)
+    if is_localised is not None and len(is_localised) != len(estimate):
+        raise InputError(
+            f"is_localised has {len(is_localised)} values for {len(estimate)} poses; give one for each pose"
+        )
+    if not max_time_difference >= 0:  # also for NaN
+        raise ConfigError(f"max_time_difference is {max_time_difference}; give a time of at least 0 seconds")
+    if frames is not None and frames < 0:
+        raise ConfigError(f"frames is {frames}; give the number of frames of the sequence")
 
 
 def note_too_few_poses(groundtruth: Trajectory | None, poses: int) -> tuple[str, ...]:
