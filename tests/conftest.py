@@ -55,12 +55,12 @@ def pytest_configure(config: pytest.Config) -> None:
     import torch
 
     import v3d_torch.slam  # noqa: F401 - registers the kernels
-    from v3d_torch.runs.kernel_compilation import compile_kernels
+    from v3d_torch.runs.kernel_compilation import compile_with_progress
 
     torch.set_num_threads(1)
     cache_dir().mkdir(parents=True, exist_ok=True)
     with FileLock(cache_dir() / "kernels-of-tests.lock"):
-        compile_kernels(Console(quiet=True))
+        compile_with_progress(Console(quiet=True))
 
 
 @pytest.hookimpl(wrapper=True)

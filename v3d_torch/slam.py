@@ -115,6 +115,8 @@ class V3DSLAM(FramePreprocessor):
         known_map: SparseMap | None = None,
     ) -> None:
         super().__init__(camera, segment, config)
+        if not isinstance(known_map, SparseMap | None):
+            raise ConfigError(f"V3DSLAM needs a SparseMap, got a {type(known_map).__name__}; give load_map(...).map")
         config = self.config
         self.timer = StageTimer()
         self.map = SparseMap.empty(config, camera) if known_map is None else known_map
@@ -374,12 +376,15 @@ class V3DSLAM(FramePreprocessor):
         The objects of the state are shared, not copied.
 
         Raises:
-            ConfigError: If the state lacks a part, for example because it was saved without an occupancy map, or if the
-                segmenter cannot load its state.
+            ConfigError: If the state lacks a part or has another one, for example because it was saved without or with
+                an occupancy map, or if the segmenter cannot load its state.
         """
-        missing = sorted(self.state_dict().keys() - state.keys())
-        if missing:
-            raise ConfigError(f"the state lacks {', '.join(missing)}; load it with the configuration of its system")
+        own = self.state_dict().keys()
+        for verb, names in (("lacks", own - state.keys()), ("has", state.keys() - own)):
+            if names:
+                raise ConfigError(
+                    f"the state {verb} {', '.join(sorted(names))}; load it with the configuration of its system"
+                )
         self.back_end.discard()  # it reads the map
         for name, component in self._components_with_state().items():
             component.load_state_dict(state[name])

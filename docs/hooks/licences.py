@@ -47,7 +47,9 @@ it.
 - Wheels can contain other libraries under their own licences, such as FFmpeg under LGPL-2.1 in OpenCV's: see their
   `*.dist-info` folders.
 - The weights of the network are under AGPL-3.0. They are not part of this package; a run with the network downloads
-  them."""
+  them.
+- The test points of ORB (`v3d_torch/features/brief_pattern.csv`) are those of OpenCV, under BSD-3-Clause (Willow
+  Garage, 2009). The photographs of the demo are CC0 or in the public domain (`v3d_torch/datasets/assets/README.md`)."""
 
 
 def page() -> Iterator[str]:

@@ -45,7 +45,7 @@ def only_trajectories_are_drawn() -> Iterator[None]:
     """Draw one figure of each run. All figures would take most of the time of runs of six frames."""
 
     def draw(folder: Path, pipeline: Pipeline, trajectory: Trajectory, _: PointMap) -> None:
-        path = folder / "trajectory.png"
+        path = folder / "figures" / "trajectory.png"
         save_trajectory_figure(pipeline.sequence.groundtruth, trajectory, path, pipeline.sequence.name)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -158,6 +158,10 @@ def test_help_lists_variants() -> None:
         (("--variants", "baseline,no_chamfr"), ("no_chamfr", "no_chamfer")),
         (("--set", "objects.voting.vote_treshold=3"), ("objects.voting.vote_threshold",)),
         (("--set", "seed=5"), ("seed=5", "--seeds")),
+        (
+            ("--variants", "full,no_voting", "--set", "objects.voting.enabled=true"),
+            ("--set objects.voting.enabled=true: full and no_voting are then the same; remove one of them",),
+        ),
         (("--set", "mapping.enabled=false"), ("mapping.enabled=false", "only `run` takes one")),
         (("--set", "segmentation.source=masks"), ("segmentation.source=masks", "only `run` takes one")),
         (("--seq", "fr3/w/xzy"), ("fr3/w/xyz",)),

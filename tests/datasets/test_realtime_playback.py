@@ -52,7 +52,7 @@ def test_frame_of_a_stream_that_is_read_too_late_counts_as_captured_when_it_was_
     next(frames)
     clock.time += 5
     frame = next(frames)
-    assert clock.time == 55 and playback.captured_at(frame) == pytest.approx(50.1) and playback.skipped == 0
+    assert clock.time == 55 and playback.captured_at(frame) == pytest.approx(50.1) and playback.dropped == 0
 
 
 def test_frames_of_a_sequence_that_are_already_due_are_skipped() -> None:
@@ -61,11 +61,11 @@ def test_frames_of_a_sequence_that_are_already_due_are_skipped() -> None:
     frames = iter(playback)
     assert next(frames).index == 0
     clock.time += 0.35  # frames 1 to 3 are due
-    assert next(frames).index == 4 and playback.skipped == 3
+    assert next(frames).index == 4 and playback.dropped == 3
     assert clock.time == pytest.approx(50.4)
     clock.time += 100  # the last frame comes in any case
-    assert [frame.index for frame in frames] == [FRAMES - 1] and playback.skipped == FRAMES - 3
-    assert len(list(playback)) == FRAMES and playback.skipped == 0
+    assert [frame.index for frame in frames] == [FRAMES - 1] and playback.dropped == FRAMES - 3
+    assert len(list(playback)) == FRAMES and playback.dropped == 0
 
 
 def test_stop_ends_the_iteration_and_the_next_one_starts_again() -> None:

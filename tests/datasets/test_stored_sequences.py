@@ -19,7 +19,7 @@ from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.datasets.depth_files import read_depth_file
 from v3d_torch.datasets.images import read_colour
 from v3d_torch.datasets.sequence_names import download_url
-from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError
+from v3d_torch.errors import DownloadError, GroundTruthWarning, InputError, OutputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import depth_to_metres
 
@@ -419,3 +419,21 @@ def test_lists_of_fr1_rpy_give_the_pairs_of_its_associations(
         (copy / name).symlink_to(source / name)
     assert load_sequence(str(copy)).stamps.tolist() == load_sequence(str(source)).stamps.tolist()
     assert [pair.depth for pair in tum._read_pairs(copy)[0]] == [pair.depth for pair in tum._read_pairs(source)[0]]
+
+
+def test_archive_stays_if_there_is_no_space_to_extract_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    downloads: list[Path] = []
+
+    def download(url: str, target: Path, **_: object) -> None:
+        downloads.append(target)
+        target.write_bytes(b"archive")
+
+    def fail(archive: Path, folder: Path) -> None:
+        raise OutputError(f"{folder}: cannot be extracted (No space left on device); choose another --data-root")
+
+    monkeypatch.setattr(locate, "fetch", download)
+    monkeypatch.setattr(locate, "extract_tar", fail)
+    for _ in range(2):
+        with pytest.raises(OutputError, match="No space left on device"):
+            load_sequence("fr1/xyz", data_root=tmp_path)
+    assert len(downloads) == 1 and downloads[0].read_bytes() == b"archive"

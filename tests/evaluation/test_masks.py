@@ -18,7 +18,7 @@ from v3d_torch.config.loading import load_config
 from v3d_torch.datasets.base import HasMotionMasks
 from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import InputError
-from v3d_torch.evaluation.masks import MaskEvaluation, count_id_switches, covering_ids, people_in_view, tally
+from v3d_torch.evaluation.masks import UNSURE, MaskEvaluation, count_id_switches, covering_ids, people_in_view, tally
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.results import write_results
 from v3d_torch.slam import V3DSLAM
@@ -146,7 +146,7 @@ def test_covering_objects_equal_a_loop_over_sets_of_pixels(seed: int, ids: list[
         own = {tuple(p) for p in (truth == person).nonzero().tolist()}
         best, best_overlap = 0, 0.5
         for id_, mask in objects.items():
-            covered = {tuple(p) for p in mask.nonzero().tolist()}
+            covered = {tuple(p) for p in (mask & (truth != UNSURE)).nonzero().tolist()}
             if (overlap := len(own & covered) / len(own | covered)) > best_overlap:
                 best, best_overlap = id_, overlap
         expected.append(best)
@@ -344,3 +344,10 @@ def test_run_is_scored_and_does_not_depend_on_ground_truth_masks(folder: Path, t
     assert run(folder, tmp_path / "unknown")["masks"] is None
     for name in ("trajectory.txt", "keyframes.txt", "map.ply", "objects.parquet", "masks/1.000000.png"):
         assert (tmp_path / "known" / name).read_bytes() == (tmp_path / "unknown" / name).read_bytes(), name
+
+
+def test_unsure_pixels_count_neither_for_nor_against_an_object() -> None:
+    truth = torch.zeros(60, 60, dtype=torch.uint8)
+    truth[20:40, 20:40] = UNSURE
+    truth[23:37, 23:37] = 1
+    assert covering_ids(truth, torch.tensor([1]), {7: truth > 0}).tolist() == [7]

@@ -53,6 +53,12 @@ class Handler(BaseHTTPRequestHandler):
             else:
                 span = f"bytes {start}-{len(CONTENT) - 1}/{len(CONTENT)}"
                 self._answer(206, CONTENT[start:], **{"Content-Range": span})
+        elif self.path == "/wrong_range" and byte_range:
+            self._answer(206, CONTENT, **{"Content-Range": f"bytes 0-{len(CONTENT) - 1}/{len(CONTENT)}"})
+        elif self.path == "/login":
+            self._answer(200, b"<html>log in</html>", **{"Content-Type": "text/html; charset=utf-8"})
+        elif self.path == "/no_address":
+            self._answer(302, b"", Location="https://[bad")
         elif self.path == "/mute416" and byte_range:
             self._answer(416, b"")
         else:
@@ -211,3 +217,20 @@ def test_unwritable_folder_is_an_output_error(server: str, tmp_path: Path) -> No
     (tmp_path / "file").write_text("not a folder")
     with pytest.raises(OutputError, match="choose another folder"):
         fetch(f"{server}/plain", tmp_path / "file" / "inside")
+
+
+def test_answer_with_another_range_is_not_appended(server: str, target: Path) -> None:
+    write_part(target, CONTENT[:1000])
+    assert fetch(f"{server}/wrong_range", target, sha256=SHA256).read_bytes() == CONTENT
+
+
+def test_web_page_in_place_of_the_file_does_not_replace_the_part(server: str, target: Path) -> None:
+    part = write_part(target, CONTENT[:1000])
+    with pytest.raises(DownloadError, match="the server answers with a web page; log in to the network"):
+        fetch(f"{server}/login", target)
+    assert part.read_bytes() == CONTENT[:1000] and not target.exists()
+
+
+def test_redirect_to_no_address_is_an_error(server: str, target: Path) -> None:
+    with pytest.raises(DownloadError, match=r"no_address: cannot be reached \("):
+        fetch(f"{server}/no_address", target)

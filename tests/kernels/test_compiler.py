@@ -194,7 +194,7 @@ def test_compilation_is_announced_once_and_loading_is_silent(monkeypatch: pytest
     for steps, expected in (([(0, 2), (0, 1), (0, 0)], 0), ([(0, 2), (1, 1), (2, 0)], 1)):
         monkeypatch.setattr(compiler, "compile_kernels", lambda steps=steps: iter(steps))
         text = StringIO()
-        kernel_compilation.compile_kernels(Console(file=text))
+        kernel_compilation.compile_with_progress(Console(file=text))
         assert text.getvalue().count("compiling kernels for this processor") == expected
 
 

@@ -113,7 +113,7 @@ def test_number_of_a_frame_counts_those_that_the_source_skipped() -> None:
 
         def __iter__(self) -> Iterator[RGBDFrame]:
             for frame, skipped in zip(frames_at(range(3)), (0, 2, 5), strict=True):
-                self.skipped = skipped
+                self.dropped = skipped
                 yield frame
 
     assert [item.number for item in capture(Bag())[1].items] == [1, 4, 8]

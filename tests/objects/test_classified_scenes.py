@@ -7,7 +7,6 @@ object is dynamic or deforming in at most 5 % of all frames, and every object ke
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -37,11 +36,12 @@ from helpers.object_scenes import (
 from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig, TrackerConfig
+from v3d_torch.config.loading import find_config
 from v3d_torch.geometry.camera import BackProjector
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.objects.frame_objects import MotionState
 
-PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
+PAPER = find_config("paper")
 MOVING = (MotionState.DYNAMIC, MotionState.DEFORMING)
 MAX_MISSED_TIME, CONFIRM_TIME = TrackerConfig().max_missed_time, StaticMaskConfig().confirm_static_time
 SEEDS = pytest.mark.parametrize("seed", [0, 1])

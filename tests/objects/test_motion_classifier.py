@@ -16,7 +16,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
-from v3d_torch.config.loading import load_config
+from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects.depth_view import DepthView
@@ -31,7 +31,7 @@ from v3d_torch.types import Instances
 CAMERA = PinholeCamera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 STRIDE = "objects.clouds.stride=1"  # a quarter of the usual resolution
 NO_UNLABELLED = "objects.free_space.min_unlabelled_area=100.0"  # square metres: no unlabelled instances
-PAPER = Path(__file__).parents[2] / "configs" / "paper.yaml"
+PAPER = find_config("paper")
 HERE = torch.eye(4, dtype=torch.float64)
 WALL = 5.0
 DOG, CHAIR, TV = 16, 56, 62

@@ -175,3 +175,32 @@ def test_one_of_two_frames_is_segmented_whatever_their_indices(indices: Sequence
         expected.append(last is None or index - last >= 2 or index == last)
         last = index if expected[-1] else last
     assert due == expected and due[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stamp": 1.7e12}, "the stamp is 1700000000000.0, in another unit or wrong; give seconds"),
+        ({"stamp": "now"}, "the stamp is 'now'; give a finite number of seconds"),
+        ({"stamp": torch.tensor(1.0)}, "the stamp is tensor"),
+        ({"depth_delay": None}, "the depth delay is None; give a finite number"),
+        ({"index": "a"}, "frame 'a': its index is no whole number"),
+    ],
+)
+def test_wrong_times_and_indices_are_rejected_before_the_frame_is_processed(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError, match=re.escape(message)):
+        make_slam()(replace(FRAME, **changes))
+
+
+def test_masked_depth_is_no_measurement() -> None:
+    depth = np.ma.masked_greater(np.array([[1.0, 9.0]]), 5)
+    frame = RGBDFrame.from_arrays(0, 0.0, np.zeros((1, 2, 3), np.uint8), depth)
+    assert frame.depth.tolist() == [[[1.0, 0.0]]]
+
+
+def test_stored_map_in_place_of_its_map_is_named() -> None:
+    known: Any = object()
+    with pytest.raises(ConfigError, match=r"V3DSLAM needs a SparseMap, got a object; give load_map\(...\)\.map"):
+        V3DSLAM(CAMERA, lambda _: INSTANCES, known_map=known)

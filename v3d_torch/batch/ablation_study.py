@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,7 @@ def run_ablation_study(
             network(_network_config(config))
         else:
             make_segmenter(config, first_camera)
+    _check_differences(variant_configs, overrides)
     folder = make_result_folder(out, "ablation")
     with lock_results(folder):
         outcomes = _run_variants(folder, sequences, configs, network, console)
@@ -160,6 +162,19 @@ def _run_variants(
         done, total = len(outcomes), len(configs) * len(sequences)
         raise InputError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
     return outcomes
+
+
+def _check_differences(configs: Mapping[str, Config], overrides: Sequence[str]) -> None:
+    """Check that no value given with ``--set`` makes two variants equal.
+
+    Raises:
+        ConfigError: If it does.
+    """
+    for first, second in combinations(configs, 2):
+        if configs[first] == configs[second]:
+            raise ConfigError(
+                f"--set {' '.join(overrides)}: {first} and {second} are then the same; remove one of them"
+            )
 
 
 def _find_variant(name: str) -> Path:

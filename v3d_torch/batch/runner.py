@@ -20,7 +20,7 @@ from v3d_torch.config import Config
 from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError
 from v3d_torch.runs.interrupts import interrupts_between_frames
-from v3d_torch.runs.kernel_compilation import compile_kernels
+from v3d_torch.runs.kernel_compilation import compile_with_progress
 from v3d_torch.runs.open_sequences import open_sequences
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import progress_bars
@@ -117,7 +117,7 @@ def run_missing_jobs(
             " all of them with --resume, or choose another folder with --out"
         )
     record.write()  # a folder that is not writable is an error before the first run
-    compile_kernels(console)  # once, and not in each worker
+    compile_with_progress(console)  # once, and not in each worker
     interrupted = _run(record, executor, console)
     for table in record.screen_tables():
         console.print(table)

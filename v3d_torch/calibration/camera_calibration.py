@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from v3d_torch.calibration.edge_alignment import EdgeAlignment
+from v3d_torch.calibration.edge_alignment import MAX_REGISTERED_SHIFT, MIN_VIEWS, EdgeAlignment
 from v3d_torch.calibration.focal_length import better_focal_lengths
 from v3d_torch.calibration.metric_scale import metric_scale
 from v3d_torch.calibration.parameters import with_values
@@ -26,12 +26,6 @@ second."""
 
 _SCALE_TOLERANCE = 0.01
 """Maximum accepted relative standard deviation of the depth scale."""
-
-_MAX_SHIFT = 0.01
-"""Maximum shift between depth and colour with which their delay is estimated, relative to the width of the image."""
-
-_MIN_VIEWS = 5
-"""Minimum number of views for an estimate of the depth delay."""
 
 _SIGNIFICANCE = 3.0
 """Number of standard deviations by which focal lengths must differ from those of a run to be those of the next."""
@@ -108,11 +102,11 @@ def _estimate_delay(
     """Estimate the delay of depth from occlusion boundaries and edges of the colour images."""
     alignment = EdgeAlignment(views, trajectory, camera.depth_delay, max_views=_MAX_VIEWS)
     value, sigma, blocks = math.nan, math.inf, 0
-    if len(alignment) >= _MIN_VIEWS:
+    if len(alignment) >= MIN_VIEWS:
         starts = alignment.search(), torch.zeros(3, dtype=torch.float64)
         found = max(map(alignment.refine, starts), key=lambda each: alignment.total_score(each.values))
         # A larger shift means that the depth is not registered, or that other edges fit by chance.
-        if float(found.values[:2].norm()) < _MAX_SHIFT * camera.width:
+        if float(found.values[:2].norm()) < MAX_REGISTERED_SHIFT * camera.width:
             value, sigma = camera.depth_delay + float(found.values[2]), float(found.sigma[2])
             blocks = found.blocks
     return decide("depth_delay", given.depth_delay, value, sigma, blocks, _DELAY_TOLERANCE)

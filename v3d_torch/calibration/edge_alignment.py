@@ -61,6 +61,13 @@ _PARTS = 4
 _MIN_CLUSTERS = 4
 """Minimum number of views or of parts of the image for a test."""
 
+MAX_REGISTERED_SHIFT = 0.01
+"""Maximum shift of depth that is registered to colour, relative to the width of the image: 6 pixels of 640, three times
+the error of the registration by a driver."""
+
+MIN_VIEWS = 5
+"""Minimum number of views for an estimate."""
+
 
 @dataclass(frozen=True)
 class Misalignment:

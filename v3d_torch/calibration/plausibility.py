@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.calibration.depth_steps import disparity_step
-from v3d_torch.calibration.edge_alignment import EdgeAlignment, Misalignment
+from v3d_torch.calibration.edge_alignment import MAX_REGISTERED_SHIFT, MIN_VIEWS, EdgeAlignment, Misalignment
 from v3d_torch.calibration.focal_length import better_focal_lengths
 from v3d_torch.calibration.people_size import check_people_size
 from v3d_torch.config import Config
@@ -29,10 +29,6 @@ accurate estimate if these do not seem to fit."""
 
 _SUSPICION = 0.5
 """Fraction of the following limits above which a first, inaccurate estimate is followed by a more accurate one."""
-
-_MIN_SHIFT = 0.01
-"""Minimum shift of depth that is reported, relative to the width of the image: 6 pixels of 640, three times the error
-of the registration by a driver."""
 
 _MIN_DELAY = 0.05
 """Minimum delay of depth that is reported, seconds: more than half a frame period, the maximum delay of cameras without
@@ -56,9 +52,6 @@ _MAX_STEP_RATIO = 1.5
 
 _KINECT_FOCAL_LENGTHS = (0.75, 1.0)
 """Focal length of cameras with the sensor of the Kinect, relative to the width of the image."""
-
-_MIN_VIEWS = 5
-"""Minimum number of keyframes for a check."""
 
 _DEPTH_VIEWS = 4
 """Number of views whose depth is examined."""
@@ -185,10 +178,13 @@ def _kinect_step_ratio(depth: Tensor, camera: PinholeCamera) -> float | None:
 def _check_registration(views: StaticViews, trajectory: Trajectory, camera: PinholeCamera) -> list[str]:
     """Compare occlusion boundaries with edges of the colour images."""
     alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _FIRST_VIEWS)
-    if len(alignment) < _MIN_VIEWS:
+    if len(alignment) < MIN_VIEWS:
         return []
     first = alignment.search()
-    if float(first[:2].norm()) < _SUSPICION * _MIN_SHIFT * camera.width and abs(first[2]) < _SUSPICION * _MIN_DELAY:
+    if (
+        float(first[:2].norm()) < _SUSPICION * MAX_REGISTERED_SHIFT * camera.width
+        and abs(first[2]) < _SUSPICION * _MIN_DELAY
+    ):
         return []
     alignment = EdgeAlignment(views, trajectory, camera.depth_delay, _MAX_VIEWS)
     delayed, shifted = (alignment.refine(alignment.search(free), free) for free in (_DELAY, _SHIFT))
@@ -214,7 +210,7 @@ def _warn_of(found: Misalignment, camera: PinholeCamera, free: tuple[int, ...] =
     """
     shift, delay = found.values[:2], float(found.values[2])
     margin = _SIGNIFICANCE * found.sigma
-    if free != _DELAY and float(shift.norm() - margin[:2].norm()) > _MIN_SHIFT * camera.width:
+    if free != _DELAY and float(shift.norm() - margin[:2].norm()) > MAX_REGISTERED_SHIFT * camera.width:
         u, v = (-shift).round().int().tolist()
         return [
             f"the depth images seem to be shifted by ({u}, {v}) pixels against the colour images; export depth that"

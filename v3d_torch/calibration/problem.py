@@ -59,7 +59,7 @@ class Adjustment(NamedTuple):
     arguments: dict[str, Any]
 
 
-class AdjustedMap(NamedTuple):
+class CostDerivatives(NamedTuple):
     """Poses and points adjusted for given parameters, and the derivatives of the minimum cost at these parameters.
 
     Attributes:
@@ -138,7 +138,7 @@ class SelfCalibration:
         """Given values of parameters, float64, shape :math:`(C,)`; for an unknown readout, that of the map."""
         return torch.tensor(get_values(self.given, self._given_readout, names), dtype=torch.float64)
 
-    def minimise(self, names: Sequence[str], start: Tensor | None = None) -> tuple[Tensor, AdjustedMap]:
+    def minimise(self, names: Sequence[str], start: Tensor | None = None) -> tuple[Tensor, CostDerivatives]:
         """Find the values of parameters with the lowest cost.
 
         Args:
@@ -149,10 +149,10 @@ class SelfCalibration:
             Values, float64, shape :math:`(C,)`, and the map adjusted for them.
         """
 
-        def linearise(state: State) -> tuple[Tensor, AdjustedMap]:
+        def linearise(state: State) -> tuple[Tensor, CostDerivatives]:
             return self.linearise(names, *state)
 
-        def step(state: State, at: AdjustedMap, damping: Tensor) -> State:
+        def step(state: State, at: CostDerivatives, damping: Tensor) -> State:
             return _damped_step(names, state[0], at, damping), at.T_cw, at.points
 
         values = self.given_values(names) if start is None else start
@@ -161,7 +161,7 @@ class SelfCalibration:
 
     def linearise(
         self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor
-    ) -> tuple[Tensor, AdjustedMap]:
+    ) -> tuple[Tensor, CostDerivatives]:
         """Adjust poses and points for given values of parameters, and differentiate the minimum cost.
 
         Args:
@@ -183,7 +183,7 @@ class SelfCalibration:
         adjusted = bundle_adjust(T_cw, points, **arguments, iterations=_INNER_STEPS, tolerance=_TOLERANCE)
         return Adjustment(adjusted.cost_after, adjusted.T_cw, adjusted.points, arguments)
 
-    def differentiate(self, names: Sequence[str], values: Tensor, adjusted: Adjustment) -> AdjustedMap:
+    def differentiate(self, names: Sequence[str], values: Tensor, adjusted: Adjustment) -> CostDerivatives:
         """Differentiate the minimum cost by parameters.
 
         Args:
@@ -197,7 +197,7 @@ class SelfCalibration:
         T_cw, points = adjusted.T_cw, adjusted.points
         problem, state, _ = prepare_bundle(T_cw, points, **adjusted.arguments, weights=None, valid=None)
         derivatives = differentiate_minimum_cost(problem, state, self.jacobian(names, values, T_cw, points))
-        return AdjustedMap(T_cw, points, *derivatives)
+        return CostDerivatives(T_cw, points, *derivatives)
 
     def residuals(self, names: Sequence[str], values: Tensor, T_cw: Tensor, points: Tensor) -> Tensor:
         """Whitened residuals of pixels and inverse depth, float64, shape :math:`(3, M)`."""
@@ -271,7 +271,7 @@ def _undistort_with_scale(camera: PinholeCamera, pixel: Tensor) -> tuple[Tensor,
     return uv, determinant.abs().sqrt() / _SCALE_STEP
 
 
-def _damped_step(names: Sequence[str], values: Tensor, at: AdjustedMap, damping: Tensor) -> Tensor:
+def _damped_step(names: Sequence[str], values: Tensor, at: CostDerivatives, damping: Tensor) -> Tensor:
     """Values of the parameters after a damped Gauss-Newton step, within their limits."""
     gradient, hessian = at.gradient.sum(dim=0), at.hessian.sum(dim=0)
     diagonal = damping * hessian.diagonal() + torch.finfo(torch.float64).tiny

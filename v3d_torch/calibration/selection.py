@@ -21,7 +21,7 @@ from v3d_torch.calibration.parameters import (
     groups_of,
     with_values,
 )
-from v3d_torch.calibration.problem import AdjustedMap, SelfCalibration
+from v3d_torch.calibration.problem import CostDerivatives, SelfCalibration
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.optim.jackknife import MAX_BLOCKS, Jackknife, jackknife_covariance, p_value
 
@@ -221,7 +221,7 @@ class ParameterSelection:
             )
 
 
-def covariance(problem: SelfCalibration, at: AdjustedMap) -> Jackknife:
+def covariance(problem: SelfCalibration, at: CostDerivatives) -> Jackknife:
     """Covariance of the free parameters at the minimum.
 
     It is the jackknife covariance over blocks of keyframes, corrected for the degrees of freedom of poses and points.

@@ -28,9 +28,9 @@ def main(
     data_root: DataRoot = None,
     camera: Camera = None,
     fps: Fps = None,
-    variants: Annotated[str, typer.Option(help="Variants to run, separated by commas [all].", show_default=False)] = (
-        "baseline,no_voting,no_free_space,no_chamfer,no_prediction,no_appearance,no_unlabelled,not_upright,"
-        "global_shutter,paper,full"
+    variants: Annotated[str, typer.Option(help="Variants to run, separated by commas.")] = (
+        "baseline, no_voting, no_free_space, no_chamfer, no_prediction, no_appearance, no_unlabelled, not_upright,"
+        " global_shutter, paper, full"
     ),
     seeds: Annotated[
         int, typer.Option(min=1, max=MAX_SEEDS, help="Number of runs of each variant, with seeds from 0.")

@@ -57,7 +57,7 @@ def main(
         from v3d_torch.io.files import check_writable, write_text
         from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
         from v3d_torch.runs.interrupts import interrupts_between_frames
-        from v3d_torch.runs.kernel_compilation import compile_kernels
+        from v3d_torch.runs.kernel_compilation import compile_with_progress
         from v3d_torch.runs.open_sequences import check_groundtruth, print_notes
         from v3d_torch.runs.print_line import print_line
         from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
@@ -81,7 +81,7 @@ def main(
             sequence = open_sequence(camera)
         print_notes(sequence, console)
         check_groundtruth(sequence)  # it determines the depth scale
-        compile_kernels(console)
+        compile_with_progress(console)
         with progress_bars(console) as progress, interrupts_between_frames() as interrupted:
             calibration = calibrate_sequence(
                 sequence,
@@ -92,4 +92,10 @@ def main(
             )
         write_text(out, calibration_text(calibration, seq))
         console.print(calibration_table(calibration))
+        if not calibration.accepted:
+            print_line(
+                console,
+                f"note: {seq}: determines no value, so that the camera is the given one; move and turn the camera more,"
+                " in front of near and far things with texture",
+            )
         print_line(console, f"camera: {out}")

@@ -16,7 +16,7 @@ from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.export.static_recording import StaticRecording
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.pipeline import Pipeline
-from v3d_torch.runs.kernel_compilation import compile_kernels
+from v3d_torch.runs.kernel_compilation import compile_with_progress
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
 from v3d_torch.runs.system import check_map_is_given, make_system
 from v3d_torch.runtime.process import set_num_threads
@@ -86,7 +86,7 @@ def record_static(
     torch.manual_seed(config.seed)
     slam = make_system(source.camera, make_segmenter(config, source.camera), config)
     pipeline = Pipeline(source, slam, evaluate_masks=False)
-    compile_kernels(console)
+    compile_with_progress(console)
     total = len(source) if isinstance(source, Sized) else None
     with TUMWriter(out, source.camera, source.groundtruth) as writer, progress_bars(console) as progress:
         recording, bar = StaticRecording(writer), TrackingBar(progress, total, interrupted, done=0)

@@ -29,7 +29,7 @@ from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runs.request import CHANGEABLE, RunRequest, check_not_moved, read_request
 from v3d_torch.runs.result_folder import check_unlocked, find_earlier_results, make_result_folder, remove_empty_folder
 from v3d_torch.runs.run import Run
-from v3d_torch.runs.run_summary import print_summary, way_to_resume
+from v3d_torch.runs.run_summary import check_complete, print_summary, way_to_resume
 from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.system import check_map_is_given
 from v3d_torch.runtime.stage_import import first_not_given
@@ -216,6 +216,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
             f"{folder}: interrupted before the results were written{way_to_resume(folder, inputs.sequence)}"
         ) from interrupt
     print_summary(request, folder, pipeline, evaluation, console, profile=display.profile)
+    check_complete(folder, pipeline)
 
 
 def _check_outputs(request: RunRequest, out: Path | None, display: Display, *, is_resumed: bool) -> bool:

@@ -43,12 +43,12 @@ class LiveStream(RGBDStream, Protocol):
 
 
 @runtime_checkable
-class SkipsFrames(Protocol):
+class DropsFrames(Protocol):
     """A stream that leaves out frames of its source to keep up with their rate."""
 
     @property
-    def skipped(self) -> int:
-        """Number of frames that were skipped since the iteration over the stream began."""
+    def dropped(self) -> int:
+        """Number of frames that were dropped since the iteration over the stream began."""
 
 
 @runtime_checkable

@@ -156,11 +156,14 @@ def _download(full_name: str, root: Path, progress: Progress | None) -> Path:
     # The lock is in the cache, because the file system of the data may not support locks.
     with file_lock(cache_dir() / full_name):
         if not folder.is_dir():
-            fetch(download_url(full_name), archive, progress=progress)
+            if not archive.is_file():  # it is left if there was no space to extract it
+                fetch(download_url(full_name), archive, progress=progress)
             try:
                 extract_tar(archive, folder)
-            finally:
+            except InputError:
                 archive.unlink()
+                raise
+            archive.unlink()
             if not is_tum(folder):
                 shutil.rmtree(folder)  # otherwise the next search finds this folder
                 raise InputError(f"{archive}: contains no rgb.txt and depth.txt; get the archive from another source")

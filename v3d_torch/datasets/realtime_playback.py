@@ -21,7 +21,7 @@ class RealtimePlayback:
     """Live stream of the frames of a source: each frame arrives at the time of its stamp, relative to the first frame.
 
     Each frame is read before it is due. Frames of a sequence that are already due when the next one is read are
-    skipped, as a camera does not wait, so that a slow computer does not fall behind. A frame counts as captured when it
+    dropped, as a camera does not wait, so that a slow computer does not fall behind. A frame counts as captured when it
     is due, even if reading it took longer.
 
     Args:
@@ -29,7 +29,7 @@ class RealtimePlayback:
         clock: Clock of the computer.
 
     Attributes:
-        skipped: Number of frames that were skipped since the iteration began.
+        dropped: Number of frames that were dropped since the iteration began.
 
     Raises:
         InputError: If the source is already live.
@@ -39,7 +39,7 @@ class RealtimePlayback:
         if isinstance(source, LiveStream):
             raise InputError(f"{source.name}: is a live camera, which always has its own rate; remove --realtime")
         self.source = source
-        self.skipped = 0
+        self.dropped = 0
         self._clock = clock
         self._offset = 0.0  # clock of the computer minus clock of the source, seconds
         self._stopped = Event()
@@ -62,7 +62,7 @@ class RealtimePlayback:
     def __iter__(self) -> Iterator[RGBDFrame]:
         """Yield each frame when it is due."""
         self._stopped.clear()
-        self.skipped = 0
+        self.dropped = 0
         source, is_first = self.source, True
         for frame in self._newest_frames(source) if isinstance(source, RGBDSequence) else source:
             if is_first:
@@ -88,7 +88,7 @@ class RealtimePlayback:
             yield sequence[index]
             due = int(torch.searchsorted(stamps, self._clock.now() - self._offset))
             following = max(index + 1, min(due, len(stamps) - 1))
-            self.skipped += following - index - 1
+            self.dropped += following - index - 1
             index = following
 
 

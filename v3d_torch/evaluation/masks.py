@@ -178,7 +178,7 @@ def covering_ids(truth: Tensor, people: Tensor, objects: Mapping[int, Tensor]) -
     overlaps = [torch.full((len(people),), _MIN_OVERLAP)]
     for mask in objects.values():
         intersection = _count_values(truth, mask)
-        union = true_areas + intersection.sum() - intersection
+        union = true_areas + intersection[:UNSURE].sum() - intersection  # as in the other scores
         overlaps.append((intersection / union.clamp(min=1))[people])
     return torch.tensor([0, *objects])[torch.stack(overlaps).argmax(dim=0)]
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
 from v3d_torch.io.files import write_png
+from v3d_torch.io.timestamps import format_timestamp
 from v3d_torch.types import RGBDFrame, Trajectory
 
 ESTIMATE = "estimated_trajectory.txt"
@@ -43,7 +44,7 @@ class StaticRecording:
         """
         self._writer.add(replace(frame, depth=torch.where(static, frame.depth, 0.0)))
         moving = (~static).to(torch.uint8).numpy() * 255
-        write_png(self._writer.folder / _MASKS / f"{frame.stamp:.6f}.png", moving)
+        write_png(self._writer.folder / _MASKS / f"{format_timestamp(frame.stamp)}.png", moving)
 
     def write_poses(self, trajectory: Trajectory) -> None:
         """Write the estimated poses.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from v3d_torch.kernels import corner_selection as kernels
+from v3d_torch.kernels.arrays import Ints
 from v3d_torch.kernels.compiler import compiled_by
 
 _DEPTH = 10
@@ -15,8 +15,6 @@ _DEPTH = 10
 
 _CELL_BITS = 2 * _DEPTH + 4
 """Bits of the code of a cell: two for each level, and four for the square cells of the first level."""
-
-Ints = NDArray[np.int64]
 
 
 def select_corners(

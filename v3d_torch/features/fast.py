@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from v3d_torch.kernels import fast as kernels
+from v3d_torch.kernels.arrays import Ints
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.kernels.fast import RADIUS
 
@@ -25,8 +26,6 @@ _CIRCLE = np.array(
      (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3)]
 )  # fmt: skip
 """Pixels (column, row) of the circle around a corner."""
-
-Ints = NDArray[np.int64]
 
 
 def _detect_corners_compiled(

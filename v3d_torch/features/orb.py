@@ -16,8 +16,7 @@ from v3d_torch.features.fast import detect_corners
 from v3d_torch.features.features import Features, sample_depth
 from v3d_torch.features.scale_pyramid import ScalePyramid, octaves_of_levels
 from v3d_torch.geometry.camera import PinholeCamera
-
-Ints = NDArray[np.int64]
+from v3d_torch.kernels.arrays import Ints
 
 _THRESHOLD, _MIN_THRESHOLD = 20, 7
 """Minimum difference of brightness between a corner and its surroundings, grey levels; the lower threshold is used in

@@ -79,9 +79,15 @@ def _complete_part(url: str, part: Path, size: int | None, progress: Progress | 
         part.unlink()
         _complete_part(url, part, size, progress, timeout)
         return
-    except (OSError, http.client.HTTPException) as error:
+    except (OSError, http.client.HTTPException, ValueError) as error:  # a ValueError if a redirect is no address
         raise DownloadError(f"{url}: cannot be reached ({_cause(error)})") from error
     with response:
+        if response.headers.get_content_type() == "text/html":  # would replace what was received before
+            raise DownloadError(f"{url}: the server answers with a web page; log in to the network, or try again later")
+        if done and response.status == 206 and _range_start(response.headers) != done:
+            part.unlink()
+            _complete_part(url, part, size, progress, timeout)
+            return
         if response.status != 206:  # not partial content: the server sends the file from its start
             done = 0
         total = _total_length(response.headers) if done else _content_length(response.headers)
@@ -119,6 +125,12 @@ def _total_length(headers: Message) -> int | None:
     return int(match[1]) if match else None
 
 
+def _range_start(headers: Message) -> int | None:
+    """Position of the first byte of the response to a range request."""
+    match = re.match(r"bytes (\d+)-", headers.get("Content-Range", "").strip())
+    return int(match[1]) if match else None
+
+
 def _content_length(headers: Message) -> int | None:
     length = headers.get("Content-Length", "")
     return int(length) if length.isdigit() else None
@@ -142,7 +154,8 @@ def _verify_part(url: str, part: Path, sha256: str | None, size: int | None) -> 
 def _cause(error: BaseException) -> str:
     """Short cause of an error, without the text that urllib adds."""
     cause = getattr(error, "reason", error)
-    return str(getattr(cause, "strerror", None) or cause or type(error).__name__)
+    text = str(getattr(cause, "strerror", None) or cause or type(error).__name__)
+    return text.strip().splitlines()[0] if text.strip() else type(error).__name__
 
 
 class _HttpsRedirects(urllib.request.HTTPRedirectHandler):

@@ -6,6 +6,7 @@ import shutil
 import tarfile
 import tempfile
 from collections.abc import Iterator
+from errno import EEXIST, EISDIR, ENAMETOOLONG, ENOTDIR
 from pathlib import Path
 from typing import Self
 
@@ -31,6 +32,9 @@ _EXTENSION_HEADERS = (
 """Types of extension headers: long names, and PAX records."""
 
 _CHUNK_SIZE = 1 << 20
+
+_ERRORS_OF_NAMES = (ENAMETOOLONG, ENOTDIR, EISDIR, EEXIST)
+"""Error numbers of archives with impossible names, or with two members of one name."""
 
 
 def extract_tar(archive: Path, folder: Path, *, max_bytes: int = MAX_BYTES) -> None:
@@ -64,7 +68,7 @@ def extract_tar(archive: Path, folder: Path, *, max_bytes: int = MAX_BYTES) -> N
         cause = f"a member leads outside or is not a plain file ({error})"
         raise InputError(f"{archive}: is unsafe, {cause}; get it from another source") from error
     except Exception as error:  # each compression raises its own errors, some of them OSError without errno
-        if isinstance(error, OSError) and error.errno is not None:
+        if isinstance(error, OSError) and error.errno not in (None, *_ERRORS_OF_NAMES):
             raise OutputError(
                 f"{folder}: cannot be extracted ({error.strerror}); choose another --data-root"
             ) from error

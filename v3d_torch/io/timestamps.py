@@ -39,6 +39,11 @@ def round_timestamp(stamp: float) -> float:
     return round(stamp, 6)
 
 
+def format_timestamp(stamp: float) -> str:
+    """Return a timestamp with six decimals, as in trajectory files and in the names of image files."""
+    return f"{stamp:.6f}"
+
+
 def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
     """Pair two lists of timestamps one to one, nearest pairs first, as the TUM benchmark's ``associate.py`` does.
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from threading import Event, Thread
 
-from v3d_torch.datasets.base import LiveStream, SkipsFrames
+from v3d_torch.datasets.base import DropsFrames, LiveStream
 from v3d_torch.errors import InputError
 from v3d_torch.io.timestamps import round_timestamp
 from v3d_torch.live.latest_queue import LatestQueue
@@ -92,7 +92,7 @@ class FrameCapture:
                 self._check(frame)
                 if self._is_in_order(frame):
                     accepted += 1
-                    skipped = self._source.skipped if isinstance(self._source, SkipsFrames) else 0
+                    skipped = self._source.dropped if isinstance(self._source, DropsFrames) else 0
                     captured_at = self._source.captured_at(frame) if isinstance(self._source, LiveStream) else now
                     self.frames.put(CapturedFrame(frame, accepted + skipped, captured_at))
         except BaseException as error:

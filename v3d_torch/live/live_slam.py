@@ -151,7 +151,7 @@ class LiveSLAM:
             on_result(result)
 
     def stop(self) -> None:
-        """End the iteration; can be called from any thread.
+        """End the iteration; can be called from any thread. It has no effect on an iteration that has not begun.
 
         Frames that already wait are still tracked. A `LiveStream` is stopped. Any other source has to end by itself;
         the iteration ends without it, after a wait of two seconds, and its thread waits for its next frame.

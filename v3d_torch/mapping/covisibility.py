@@ -45,7 +45,7 @@ def covisible_keyframes(tables: MapTables, landmarks: Tensor, count: int) -> Ten
     return torch.from_numpy(order[shared[order] > 0])
 
 
-def observed_landmarks(tables: MapTables, keyframes: Tensor) -> Tensor:
+def landmarks_ever_observed(tables: MapTables, keyframes: Tensor) -> Tensor:
     """Find the landmarks that any of the given keyframes observes or observed.
 
     Observations that a bundle adjustment removed as outliers count, too: their landmarks are in view, and can be

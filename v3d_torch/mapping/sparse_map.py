@@ -14,7 +14,7 @@ from v3d_torch.features.projection_matcher import LocalMap
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert, orthonormalise
 from v3d_torch.mapping import landmark_ids
-from v3d_torch.mapping.covisibility import covisible_keyframes, observed_landmarks
+from v3d_torch.mapping.covisibility import covisible_keyframes, landmarks_ever_observed
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_creation import create_landmarks, landmark_points, select_new_landmarks
 from v3d_torch.mapping.map_tables import MapTables
@@ -93,7 +93,7 @@ class SparseMap(MapTables):
             landmarks: Ids of the landmarks that the previous frame observed, int64, shape :math:`(L,)`.
             count: Maximum number of keyframes.
         """
-        return self.select_landmarks(observed_landmarks(self, covisible_keyframes(self, landmarks, count)))
+        return self.select_landmarks(landmarks_ever_observed(self, covisible_keyframes(self, landmarks, count)))
 
     def select_landmarks(self, landmarks: Tensor) -> LocalMap:
         """Return the active landmarks among the given ones as a local map.

@@ -23,6 +23,7 @@ from v3d_torch.errors import InputError, StageError, V3DError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.files import write_png
 from v3d_torch.io.text import first_line
+from v3d_torch.io.timestamps import format_timestamp
 from v3d_torch.live.live_slam import LiveResult, LiveSLAM
 from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState
@@ -249,7 +250,7 @@ class Pipeline:
             self._evaluate_masks(frame, result)
         for folder, static in zip(self._mask_folders, (result.static_mask, result.map_mask), strict=True):
             if folder is not None:
-                write_png(folder / f"{frame.stamp:.6f}.png", (~static).to(torch.uint8).numpy() * 255)
+                write_png(folder / f"{format_timestamp(frame.stamp)}.png", (~static).to(torch.uint8).numpy() * 255)
         keyframe = self.slam.map.keyframe_at(frame.stamp)
         if keyframe is not None:
             static = result.map_mask

@@ -14,7 +14,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.checkpoint import Checkpoint
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.interrupts import interrupts_between_frames
-from v3d_torch.runs.kernel_compilation import compile_kernels
+from v3d_torch.runs.kernel_compilation import compile_with_progress
 from v3d_torch.runs.log import log_to, show_warnings
 from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
@@ -47,7 +47,7 @@ def run_with_progress(
     with lock_results(folder):
         if checkpoint is None:
             clear_earlier_results(folder)
-        compile_kernels(console)
+        compile_with_progress(console)
         log = log_to(folder / RunFile.LOG, append=checkpoint is not None)
         warnings = show_warnings(partial(print_line, console))
         with progress_bars(console) as progress, interrupts_between_frames(sequence) as interrupted, log, warnings:

@@ -14,7 +14,7 @@ from v3d_torch.runs.progress_bar import ProgressBar, progress_bars
 from v3d_torch.runtime.imports import import_environment
 
 
-def compile_kernels(console: Console) -> None:
+def compile_with_progress(console: Console) -> None:
     """Load the compiled kernels, or compile them with a progress bar, which takes half a minute once."""
     bar = None
     with progress_bars(console) as progress, ExitStack() as resources:

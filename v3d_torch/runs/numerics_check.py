@@ -20,14 +20,12 @@ from v3d_torch.errors import NumericsError
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.stages.stage_checks import RESULTS
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_NOT_STAGES = frozenset(
-    {"camera", "config", "timer", "map", "poses", "states", "motion_model", "up_estimator", "predictions", "occupancy"}
-)
-"""Public attributes of `V3DSLAM` that are not stages. The occupancy map consists of whole numbers, and NaN in its
-queries means unknown space."""
+_CHECKED = {"segment", *RESULTS, "estimate_motion", "track_map", "loop_closer"} - {"motion_model"}
+"""Names of the stages whose results are checked. Motion model and map have other checks."""
 
 MAY_BE_NAN = frozenset(
     {
@@ -116,8 +114,7 @@ class CheckedSLAM(V3DSLAM):
     """
 
     def __setattr__(self, name: str, value: object) -> None:
-        is_stage = not name.startswith("_") and name not in _NOT_STAGES
-        super().__setattr__(name, CheckedStage(value, name) if is_stage else value)
+        super().__setattr__(name, CheckedStage(value, name) if name in _CHECKED else value)
 
     def check(self, frame: RGBDFrame) -> None:
         """Run `V3DSLAM.check`.

@@ -30,7 +30,7 @@ _STATE_COLUMNS = (
 )  # fmt: skip
 """Columns of velocity, uncertainty and box of an object."""
 
-_DYNAMICS = pa.schema(
+_OBJECTS = pa.schema(
     [
         ("frame", pa.int64()),
         ("stamp", pa.float64()),
@@ -154,4 +154,4 @@ def _object_table(objects: ObjectTable) -> pa.Table:
         "missed": objects["missed"],
     }
     arrays = {name: column if isinstance(column, list) else column.numpy() for name, column in columns.items()}
-    return pa.table(arrays, schema=_DYNAMICS)
+    return pa.table(arrays, schema=_OBJECTS)

@@ -32,12 +32,12 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.mesh import fuse_mesh
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runs.diagnosis import check_lost_frames, diagnose
-from v3d_torch.runs.file_names import FIGURES, RunFile
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.result_tables import ResultTables, collect_tables
+from v3d_torch.runs.run_figures import draw_run
 from v3d_torch.types import TrackingStatus, Trajectory
 from v3d_torch.viz.camera_path import make_camera_path
-from v3d_torch.viz.run_figures import draw_run
 
 if sys.platform != "win32":
     import resource
@@ -76,7 +76,7 @@ def write_results(folder: Path, pipeline: Pipeline, request: RunRequest | None =
         pipeline.warn(check_lost_frames(pipeline))
         record.diagnosis = diagnose(pipeline, request, tables.evaluation_error)
     _write_maps(folder, pipeline, tables.trajectory, point_map)
-    draw_run(folder / FIGURES, pipeline, tables.trajectory, point_map)
+    draw_run(folder, pipeline, tables.trajectory, point_map)
     metrics |= {"failure": record.failure, "diagnosis": record.diagnosis, "warnings": record.warnings}
     metrics["peak_memory_mb"] = _peak_memory_mb()
     _write_metrics(folder, metrics)

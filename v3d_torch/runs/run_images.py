@@ -18,6 +18,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.export.posed_image import PosedImage
 from v3d_torch.io.download import Progress
 from v3d_torch.io.image_file import read_image
+from v3d_torch.io.timestamps import format_timestamp
 from v3d_torch.runs.file_names import MAP_MASKS
 from v3d_torch.runs.request import RunRequest, check_not_moved
 from v3d_torch.runs.stored_run import StoredRun
@@ -149,7 +150,11 @@ def _read_images(
                 " pass the sequence of this run with --seq"
             )
         size = frame.depth.shape[1:]
-        static = torch.ones(size, dtype=torch.bool) if masks is None else _read_mask(masks / f"{stamp:.6f}.png", size)
+        static = (
+            torch.ones(size, dtype=torch.bool)
+            if masks is None
+            else _read_mask(masks / f"{format_timestamp(stamp)}.png", size)
+        )
         yield PosedImage(frame, T_wc, static)
 
 

@@ -42,9 +42,6 @@ def print_summary(
         evaluation: Scores; None if there are none.
         console: Console.
         profile: True to print the time of each stage.
-
-    Raises:
-        InputError: If the run ended early, or its results are incomplete.
     """
     record = pipeline.record
     difference = describe_difference(pipeline.sequence)
@@ -62,6 +59,15 @@ def print_summary(
     if record.save_error is not None:
         print_line(console, f"note: no checkpoint was saved, {record.save_error}")
     print_line(console, f"results: {folder}")
+
+
+def check_complete(folder: Path, pipeline: Pipeline) -> None:
+    """Check that a run reached the end of its sequence with complete results.
+
+    Raises:
+        InputError: If the run ended early, or its results are incomplete.
+    """
+    record = pipeline.record
     if record.failure is not None:
         frames, fix = len(pipeline.slam.poses), way_to_resume(folder, pipeline.sequence)
         results = f"the results of the {frames} frames before are in {folder}{fix}"

@@ -18,6 +18,7 @@ from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.evaluation import Evaluation, evaluate
 from v3d_torch.io.text import first_line
 from v3d_torch.io.text_file import read_text
+from v3d_torch.io.timestamps import format_timestamp
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.metrics_file import Metrics, read_metrics, suggest_folder
 from v3d_torch.types import Trajectory
@@ -120,11 +121,11 @@ def _check_stamps(folder: Path, stamps: Tensor, tables: Mapping[RunFile, pa.Tabl
     Raises:
         InputError: If a table is from another run.
     """
-    known = {f"{stamp:.6f}" for stamp in stamps.tolist()}  # the precision of trajectory files
+    known = set(map(format_timestamp, stamps.tolist()))  # the precision of trajectory files
     for file, table in tables.items():
         if table is None:
             continue
-        found = {f"{stamp:.6f}" for stamp in table["stamp"].to_pylist()}
+        found = set(map(format_timestamp, table["stamp"].to_pylist()))
         if not found <= known or (file is RunFile.FRAMES and len(table) != len(stamps)):
             raise InputError(
                 f"{folder}: {file} and trajectory.txt have other timestamps, so they belong to different runs; run the"

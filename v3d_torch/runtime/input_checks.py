@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
 from typing import NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import implausible_median
 from v3d_torch.io.timestamps import round_timestamp
 from v3d_torch.runtime.value_rules import FINITE, FRACTIONS, Rule
-from v3d_torch.types import Instances, RGBDFrame
+from v3d_torch.types import MAX_STAMP, Instances, RGBDFrame
 
 _MAX_NORM_ERROR = 1e-3
 """Maximum difference between the length of a unit vector and 1."""
@@ -91,9 +92,15 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
             raise InputError(
                 f"frame {frame.index}: the {name} image is {wrong}; RGBDFrame.from_arrays makes frames from arrays"
             )
-    for name, seconds in (("stamp", frame.stamp), ("depth delay", frame.depth_delay)):
-        if not math.isfinite(seconds):
-            raise InputError(f"frame {frame.index}: the {name} is {seconds}; give a finite number of seconds")
+    index: object = frame.index
+    if not isinstance(index, Integral):
+        raise InputError(f"frame {index!r}: its index is no whole number; number the frames from 0")
+    times: Mapping[str, object] = {"stamp": frame.stamp, "depth delay": frame.depth_delay}
+    for name, seconds in times.items():
+        if not isinstance(seconds, Real) or not math.isfinite(seconds):
+            raise InputError(f"frame {frame.index}: the {name} is {seconds!r}; give a finite number of seconds")
+    if frame.stamp > MAX_STAMP:
+        raise InputError(f"frame {frame.index}: the stamp is {frame.stamp!r}, in another unit or wrong; give seconds")
     gravity = frame.gravity
     if gravity is not None:
         wrong = describe_wrong_tensor(gravity, (3,), torch.float64)

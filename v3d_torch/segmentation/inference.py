@@ -227,11 +227,13 @@ def open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
     options.enable_cpu_mem_arena = False
     # Spinning threads would slow down torch, which computes between two calls.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.log_severity_level = 4  # only fatal errors: others are raised
     try:
         return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the exceptions of onnxruntime have no common base class
         raise WeightsError(
-            f"{path}: is not a network that onnxruntime can load; delete the file or export it again"
+            f"{path}: is not a network that onnxruntime can load; delete the file or export it again, with its weights"
+            " in the same file"
         ) from error
 
 

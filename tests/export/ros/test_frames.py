@@ -46,8 +46,9 @@ def test_point_is_the_same_by_camera_and_by_world(T_wc: Tensor) -> None:
 @given(st.lists(poses, min_size=2, max_size=6))
 def test_odometry_in_uncorrected_map_is_motion_since_the_first_frame(cameras: list[Tensor]) -> None:
     odometry = OdometryFrame()
-    for previous, current in zip([cameras[0], *cameras], cameras, strict=False):
-        odometry.update(previous, current)
+    first = cameras[0]
+    for before, previous, current in zip([first, first, *cameras], [first, *cameras], cameras, strict=False):
+        odometry.update(before, previous, current)
         torch.testing.assert_close(odometry.T_mo @ odometry.T_ol, current)
         torch.testing.assert_close(odometry.T_mo[:3, 3], cameras[0][:3, 3])
         torch.testing.assert_close(odometry.T_mo[2, :3], EYE[2, :3])  # z up, as in map
@@ -57,17 +58,17 @@ def test_odometry_begins_with_the_yaw_of_the_first_camera() -> None:
     """The camera is pitched downwards in a level map."""
     odometry, T_ml = OdometryFrame(), se3_exp(torch.tensor([1.0, 2, 3, 0, 0, 0.5], dtype=torch.float64))
     pitch = se3_exp(torch.tensor([0, 0, 0, 0, 0.6, 0], dtype=torch.float64))
-    odometry.update(T_ml @ pitch, T_ml @ pitch)
+    odometry.update(*[T_ml @ pitch] * 3)
     torch.testing.assert_close(odometry.T_ol, pitch)
     torch.testing.assert_close(odometry.T_mo, T_ml)
 
 
 def test_correction_of_the_map_moves_the_odometry_frame_and_not_the_camera_in_it() -> None:
     odometry = OdometryFrame()
-    odometry.update(EYE, EYE)
-    odometry.update(EYE, move(1, 0, 0))
+    odometry.update(EYE, EYE, EYE)
+    odometry.update(EYE, EYE, move(1, 0, 0))
     T_new_old = se3_exp(torch.tensor([0.1, 0.2, 0.0, 0.0, 0.0, 0.3], dtype=torch.float64))
-    odometry.update(T_new_old @ move(1, 0, 0), T_new_old @ move(1.5, 0, 0))
+    odometry.update(T_new_old, T_new_old @ move(1, 0, 0), T_new_old @ move(1.5, 0, 0))
     torch.testing.assert_close(odometry.T_ol, move(1.5, 0, 0))
     torch.testing.assert_close(odometry.T_mo @ odometry.T_ol, T_new_old @ move(1.5, 0, 0))
     torch.testing.assert_close(odometry.T_mo, T_new_old)
@@ -76,6 +77,18 @@ def test_correction_of_the_map_moves_the_odometry_frame_and_not_the_camera_in_it
 def test_convention_orientations_stay_orthonormal_over_many_frames() -> None:
     odometry, T_pl = OdometryFrame(), se3_exp(torch.tensor([0.1, 0, 0, 0.02, 0.01, 0.03], dtype=torch.float64))
     for _ in range(2000):
-        odometry.update(EYE, T_pl)
+        odometry.update(EYE, T_pl, T_pl @ T_pl)
     R = odometry.T_ol[:3, :3]
     torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_refinement_of_the_previous_frame_is_a_part_of_the_motion() -> None:
+    """Each pose is 0.01 m too far when it is new, and right once the next frame is known."""
+    odometry = OdometryFrame()
+    odometry.update(EYE, EYE, EYE)
+    for n in range(1, 11):
+        odometry.update(move(0.1 * max(n - 2, 0), 0, 0), move(0.1 * (n - 1), 0, 0), move(0.1 * n + 0.01, 0, 0))
+    torch.testing.assert_close(odometry.T_ol, move(1.01, 0, 0))
+    odometry.turn_map(move(7, 0, 0))
+    torch.testing.assert_close(odometry.T_ol, move(1.01, 0, 0))
+    torch.testing.assert_close(odometry.T_mo, move(5.99, 0, 0))

@@ -43,8 +43,8 @@ def ensure_demo(cache_dir: Path, progress: Progress | None = None, name: str = "
             _publish(folder, sequence)
     except OSError as error:
         raise OutputError(
-            f"{cache_dir}: cannot store {name} ({error.strerror or error}); free the disk or set V3D_CACHE to another"
-            " folder"
+            f"{cache_dir}: cannot store {name} ({error.strerror or error}); set V3D_CACHE to another folder, or"
+            " free the disk if it is full"
         ) from error
     return sequence
 

@@ -22,15 +22,19 @@ def index_by_stamp(
         path: Path of the bag, for messages.
         topic: Topic of the images, for messages.
         stamps: Stamps in the headers, seconds, in the order of arrival; all are 0 if the headers are not filled in.
-        arrivals: Times of arrival, seconds, which replace stamps that are all 0.
+        arrivals: Times of arrival, seconds, which replace stamps that are all equal.
 
     Returns:
-        Index of the image by stamp, increasing; and a sentence on the images that were dropped, None if there are none.
+        Index of the image by stamp, increasing; and a sentence on the images that were dropped, or on stamps that are
+        all equal but not 0, None if there are neither.
 
     Raises:
         InputError: If more than a tenth of the images would be dropped.
     """
-    if not any(stamps):
+    note = None
+    if len(set(stamps)) == 1:
+        if any(stamps) and len(stamps) > 1:
+            note = f"{topic}: all images have the stamp {stamps[0]:.6f} s; their times of arrival are used"
         stamps = arrivals
     indices: dict[float, int] = {}
     newest, dropped = -math.inf, []
@@ -41,7 +45,7 @@ def index_by_stamp(
         elif stamp < newest:  # an equal stamp is that of an image that was published twice
             dropped.append(index)
     if not dropped:
-        return indices, None
+        return indices, note
     first = dropped[0]
     jump = f"the stamps jump back from {stamps[first - 1]:.6f} to {stamps[first]:.6f} s after {first} images"
     count = f"{len(dropped)} of {len(stamps)} images"

@@ -70,11 +70,12 @@ def points_in_map(points: Tensor, T_mw: Tensor) -> Tensor:
 
 
 class OdometryFrame:
-    """Frame ``odom``: the product of the camera's motions, each measured in the map at the time of the motion.
+    """Frame ``odom``: the product of the camera's motions, each as it is known one frame after the motion.
 
-    It begins at the first camera, with its yaw, and with z up as in ``map`` at that time. When bundle adjustment or a
-    loop moves the map, or when ``map`` is turned because up has become known, the camera stays where it is in ``odom``,
-    and the pose of ``odom`` in ``map`` changes.
+    It begins at the first camera, with its yaw, and with z up as in ``map`` at that time. The pose of a frame is
+    refined once the motion to the next frame is known; the camera then moves by this correction of some millimetres,
+    which would otherwise add up. When a loop moves the map, or when ``map`` is turned because up has become known, the
+    camera stays where it is in ``odom``, and the pose of ``odom`` in ``map`` changes.
 
     Attributes:
         T_ol: Pose of ``camera_link`` in ``odom``, float64, shape :math:`(4, 4)`.
@@ -84,18 +85,27 @@ class OdometryFrame:
     def __init__(self) -> None:
         self.T_ol = torch.eye(4, dtype=torch.float64)
         self.T_mo = torch.eye(4, dtype=torch.float64)
-        self._is_empty = True
+        self._T_oa: Tensor | None = None  # pose in ``odom`` of the frame before the previous one
 
-    def update(self, T_mp: Tensor, T_ml: Tensor) -> None:
+    def update(self, T_ma: Tensor, T_mp: Tensor, T_ml: Tensor) -> None:
         """Move the camera to the next frame.
 
         Args:
-            T_mp: Pose of ``camera_link`` at the previous frame, in the current map, float64, shape :math:`(4, 4)`; at
-                the first frame the pose of this frame.
-            T_ml: Pose of ``camera_link`` at this frame, in the current map, float64, shape :math:`(4, 4)`.
+            T_ma: Pose of ``camera_link`` at the frame before the previous one, in the current map, float64, shape
+                :math:`(4, 4)`. At the first two frames it is that of the first.
+            T_mp: The same at the previous frame; at the first frame that of this frame.
+            T_ml: The same at this frame.
         """
-        if self._is_empty:
-            T_mc = T_ml @ T_LINK_OPTICAL
-            self.T_ol, self._is_empty = level_frame(T_mc[2, :3]) @ invert(T_LINK_OPTICAL), False
-        self.T_ol = orthonormalise(self.T_ol @ invert(T_mp) @ T_ml)
+        if self._T_oa is None:
+            self._T_oa = level_frame((T_ml @ T_LINK_OPTICAL)[2, :3]) @ invert(T_LINK_OPTICAL)
+        T_om = self._T_oa @ invert(T_ma)
+        self.T_ol, self._T_oa = orthonormalise(T_om @ T_ml), orthonormalise(T_om @ T_mp)
+        self.turn_map(T_ml)
+
+    def turn_map(self, T_ml: Tensor) -> None:
+        """Keep the camera where it is in ``odom``, although its pose in the map has changed.
+
+        Args:
+            T_ml: Pose of ``camera_link`` at the newest frame, in the current map, float64, shape :math:`(4, 4)`.
+        """
         self.T_mo = T_ml @ invert(self.T_ol)

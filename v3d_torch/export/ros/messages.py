@@ -112,7 +112,8 @@ def odometry(
         twist: Velocity of the child frame, in the child frame: linear (m/s) and angular (rad/s), float64, shape
             :math:`(6,)`.
         pose_covariance: Covariance of position and of rotation about the axes of the parent frame, in this order,
-            metres and radians, shape :math:`(6, 6)`.
+            metres and radians, shape :math:`(6, 6)`. `RunMessages` gives that of the pose in ``map``, which does not
+            contain the drift of ``odom``.
         twist_covariance: Covariance of the twist, shape :math:`(6, 6)`.
     """
     velocity = ros.geometry_msgs__msg__Twist(vector(twist[:3]), vector(twist[3:]))

@@ -74,7 +74,7 @@ class RunMessages:
         self.stamp = math.nan
         self._camera = camera
         self._odometry_frame = frames.OdometryFrame()
-        self._previous: int | None = None  # position in the pose history
+        self._last: list[int] = []  # positions in the pose history of the last two frames with a pose
         self._T_mw = frames.map_frame(None)  # as at the last frame
         self._has_markers = False
 
@@ -120,9 +120,9 @@ class RunMessages:
         self.stamp, trajectory, T_mw = slam.poses.stamp, slam.poses.trajectory(), frames.map_frame(slam.T_lw)
         if not torch.equal(T_mw, self._T_mw):
             self.stamp, self._T_mw = self.stamp + _TURN_DELAY, T_mw
-            newest = len(slam.poses) - 1 if self._previous is None else self._previous
+            newest = self._last[-1] if self._last else len(slam.poses) - 1
             T_ml = frames.camera_in_map(invert(slam.poses.poses_of([newest])[0]), T_mw)
-            self._odometry_frame.update(T_ml, T_ml)
+            self._odometry_frame.turn_map(T_ml)
             yield "/tf", self._tree(self.stamp, is_lost=slam.poses.status is TrackingStatus.LOST)
         yield (
             "/path",
@@ -147,9 +147,10 @@ class RunMessages:
     def _pose_messages(self, stamp: float, slam: V3DSLAM) -> Iterator[TopicMessage]:
         odometry_frame, state = self._odometry_frame, slam.states.at(stamp)
         newest = len(slam.poses) - 1
-        previous = newest if self._previous is None else self._previous
-        odometry_frame.update(*frames.camera_in_map(invert(slam.poses.poses_of([previous, newest])), self._T_mw))
-        self._previous = newest
+        known = [*self._last, newest]
+        T_cw = slam.poses.poses_of([known[0]] * (3 - len(known)) + known)
+        odometry_frame.update(*frames.camera_in_map(invert(T_cw), self._T_mw))
+        self._last = known[-2:]
         yield "/tf", self._tree(stamp)
         to_link = _rotate_both_halves(frames.T_LINK_OPTICAL)
         to_odom = _rotate_both_halves(odometry_frame.T_ol @ frames.T_LINK_OPTICAL)

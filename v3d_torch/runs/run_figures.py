@@ -12,6 +12,7 @@ from v3d_torch.objects.frame_objects import TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
 from v3d_torch.reconstruction.point_map import PointMap
+from v3d_torch.runs.file_names import RunFile
 from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure
 from v3d_torch.viz.figure_output import save_figure
@@ -27,7 +28,7 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
     """Draw trajectory, masks, objects, occupancy map, and votes and clouds of the most dynamic frame, if there are any.
 
     Args:
-        folder: Folder of the images.
+        folder: Folder of the results.
         pipeline: Pipeline after the run.
         trajectory: Poses of all frames.
         point_map: Static map.
@@ -38,23 +39,23 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
     sequence, record = pipeline.sequence, pipeline.record
     poses = pipeline.slam.poses
     groundtruth = sequence.groundtruth if poses.was_found else None  # lost poses cannot be aligned to it
-    save_trajectory_figure(groundtruth, trajectory, folder / "trajectory.png", sequence.name, poses.statuses)
+    save_trajectory_figure(groundtruth, trajectory, folder / RunFile.TRAJECTORY_FIGURE, sequence.name, poses.statuses)
     if record.snapshots:
         images = [snapshot.frame.image for snapshot in record.snapshots]
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
-        save_mask_figure(images, overlays, folder / "masks.png")
+        save_mask_figure(images, overlays, folder / RunFile.MASKS_FIGURE)
     if len(record.objects):
         figure = draw_objects(record.objects, trajectory, point_map.points, pipeline.slam.up, sequence.name)
-        save_figure(figure, folder / "objects.png")
+        save_figure(figure, folder / RunFile.OBJECTS_FIGURE)
     mapper = pipeline.slam.occupancy
     if mapper is not None and not mapper.map.is_empty:
         up, floor = mapper.up.direction, mapper.find_floor()
-        save_figure(draw_occupancy(mapper.map, trajectory, up, floor, sequence.name), folder / "occupancy.png")
+        save_figure(draw_occupancy(mapper.map, trajectory, up, floor, sequence.name), folder / RunFile.OCCUPANCY_FIGURE)
     snapshot = record.most_dynamic_snapshot
     if snapshot is not None and snapshot.result.vote_pairs:
-        _draw_votes(folder / "voting.png", pipeline, snapshot, _title(snapshot, trajectory))
+        _draw_votes(folder / RunFile.VOTING_FIGURE, pipeline, snapshot, _title(snapshot, trajectory))
     if snapshot is not None and (clusters := _clusters(pipeline, snapshot)):
-        save_clusters_figure(clusters, folder / "clusters.png", _title(snapshot, trajectory))
+        save_clusters_figure(clusters, folder / RunFile.CLUSTERS_FIGURE, _title(snapshot, trajectory))
 
 
 def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot, title: str) -> None:
