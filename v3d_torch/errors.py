@@ -33,6 +33,10 @@ class OutputError(V3DError):
     """A result cannot be written: no permission, or the disk is full."""
 
 
+class RunError(V3DError):
+    """A run, or a run of a batch, ended early or has incomplete results."""
+
+
 class LockedError(OutputError):
     """Another run or batch is writing to the folder of the results."""
 

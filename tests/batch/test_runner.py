@@ -15,7 +15,7 @@ from v3d_torch.batch.batch_record import BatchRecord
 from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.batch.runner import run_missing_jobs
-from v3d_torch.errors import InputError
+from v3d_torch.errors import RunError
 from v3d_torch.evaluation.tables import ErrorTable
 
 
@@ -38,6 +38,6 @@ class CountedRecord(BatchRecord):
 @pytest.mark.parametrize("is_terminal", [False, True])
 def test_progress_table_is_made_for_a_terminal_only(is_terminal: bool, moment: Path, tmp_path: Path) -> None:
     record = CountedRecord(plan_seeds(moment, tmp_path, seeds=3), tmp_path)
-    with pytest.raises(InputError, match=r"^3 of 3 runs failed; .* to run them again$"):
+    with pytest.raises(RunError, match=r"^3 of 3 runs failed; .* to run them again$"):
         run_missing_jobs(record, fail_all, Console(file=StringIO(), force_terminal=is_terminal), resume=False)
     assert record.tables_made == 3 * is_terminal

@@ -109,7 +109,7 @@ def test_run_that_ends_before_its_first_frame_leaves_no_empty_folder(
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("v3d_torch.runs.console.compile_kernels", interrupt)
+    monkeypatch.setattr("v3d_torch.runs.console.compile_with_progress", interrupt)
     (tmp_path / "own").mkdir()
     for options in (["--out", "out"], [], ["--out", "own"]):
         done = call("--seq", moment, "--segmenter", "none", "--realtime", *options)

@@ -19,7 +19,7 @@ from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config, SegmentationConfig
 from v3d_torch.config.loading import find_config, load_config
 from v3d_torch.datasets import RGBDSequence
-from v3d_torch.errors import ConfigError, InputError, OutputError
+from v3d_torch.errors import ConfigError, InputError, OutputError, RunError
 from v3d_torch.evaluation.ablation import (
     LEGEND,
     PAPER_RESULTS,
@@ -118,7 +118,7 @@ def run_ablation_study(
     console.print(f"{LEGEND}\n{PAPER_RESULTS}", markup=False)
     print_line(console, f"results: {folder}")
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
-        raise InputError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
+        raise RunError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
 
 
 def _run_variants(
@@ -160,7 +160,7 @@ def _run_variants(
             console.print(make_screen_table([outcome for outcome in outcomes if outcome.sequence == name]))
     except KeyboardInterrupt as interrupt:
         done, total = len(outcomes), len(configs) * len(sequences)
-        raise InputError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
+        raise RunError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
     return outcomes
 
 

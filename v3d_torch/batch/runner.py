@@ -18,7 +18,7 @@ from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.batch.wide_console import wide_console
 from v3d_torch.config import Config
 from v3d_torch.datasets.sequence_patterns import matching_sequences
-from v3d_torch.errors import InputError, OutputError
+from v3d_torch.errors import InputError, OutputError, RunError
 from v3d_torch.runs.interrupts import interrupts_between_frames
 from v3d_torch.runs.kernel_compilation import compile_with_progress
 from v3d_torch.runs.open_sequences import open_sequences
@@ -130,13 +130,13 @@ def run_missing_jobs(
     total, failed, incomplete = len(record.jobs), len(record.failed), len(record.incomplete)
     if interrupted and (failed or record.missing):
         done = len(record.outcomes) - failed
-        raise InputError(
+        raise RunError(
             f"interrupted with {done} of {total} runs done; repeat the command with --resume to run the others"
         )
     if failed:
-        raise InputError(f"{failed} of {total} runs failed; repeat the command with --resume to run them again{advice}")
+        raise RunError(f"{failed} of {total} runs failed; repeat the command with --resume to run them again{advice}")
     if incomplete:
-        raise InputError(f"{incomplete} of {total} runs have incomplete results; the causes are above")
+        raise RunError(f"{incomplete} of {total} runs have incomplete results; the causes are above")
 
 
 def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
@@ -146,7 +146,7 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
         True if the user interrupted the batch.
 
     Raises:
-        InputError: If the user interrupted it twice.
+        RunError: If the user interrupted it twice.
         OutputError: If the tables cannot be written.
     """
     write_error: OutputError | None = None
@@ -171,7 +171,7 @@ def _run(record: BatchRecord, executor: Executor, console: Console) -> bool:
                             write_error = error
                             stop.set()
         except KeyboardInterrupt as interrupt:
-            raise InputError(
+            raise RunError(
                 "interrupted twice: the running jobs were killed; repeat the command with --resume to continue"
             ) from interrupt
     if write_error is not None:

@@ -50,7 +50,7 @@ def main(
         from v3d_torch.config.loading import FULL, find_config, load_config
         from v3d_torch.datasets import SourceOptions, open_source
         from v3d_torch.datasets.stored import StoredSequence
-        from v3d_torch.errors import ConfigError, InputError
+        from v3d_torch.errors import ConfigError, InputError, RunError
         from v3d_torch.runs.interrupts import interrupts_between_frames
         from v3d_torch.runs.open_sequences import print_notes
         from v3d_torch.runs.print_line import print_line
@@ -71,7 +71,7 @@ def main(
             else:
                 frames, failure = record_all(source, out, interrupted, console), None
         if failure is not None:
-            raise InputError(f"{failure} (the {frames} frames before are saved in {out})")
+            raise RunError(f"{failure} (the {frames} frames before are saved in {out})")
         if not frames:
             raise InputError(f"{seq}: the source ended before its first frame")
         print_line(console, f"{frames} frames: {out}")

@@ -15,7 +15,7 @@ from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.datasets.realtime_playback import RealtimePlayback
-from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError
+from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError, RunError
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import StoredMap, load_map
 from v3d_torch.pipeline import Viewer, ViewerGroup
@@ -212,7 +212,7 @@ def _run(request: RunRequest, out: Path | None, checkpoint: Checkpoint | None, d
     except KeyboardInterrupt as interrupt:  # the first Ctrl-C ends the run after the current frame
         if is_new:
             remove_empty_folder(folder)
-        raise InputError(
+        raise RunError(
             f"{folder}: interrupted before the results were written{way_to_resume(folder, inputs.sequence)}"
         ) from interrupt
     print_summary(request, folder, pipeline, evaluation, console, profile=display.profile)
@@ -232,7 +232,8 @@ def _check_outputs(request: RunRequest, out: Path | None, display: Display, *, i
         _check_map_path(Path(request.save_map), out, display)
     if out is None:
         return False
-    if Path(request.seq).is_dir() and os.path.realpath(out) == os.path.realpath(request.seq):
+    source = Path(request.absolute().seq)  # relative if it is the name of a sequence
+    if source.is_absolute() and os.path.realpath(out) == os.path.realpath(source):
         raise OutputError(f"{out}: is the folder of the sequence; choose another folder with --out")
     check_unlocked(out)
     return _check_contents(out, _path(request.masks), is_resumed=is_resumed)

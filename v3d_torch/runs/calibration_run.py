@@ -14,7 +14,7 @@ from v3d_torch.calibration.selection import Estimate
 from v3d_torch.config import Config
 from v3d_torch.datasets.base import RGBDSequence
 from v3d_torch.datasets.camera_text import camera_text
-from v3d_torch.errors import InputError
+from v3d_torch.errors import RunError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.io.text import printable
 from v3d_torch.pipeline import FrameCallback, Pipeline
@@ -60,7 +60,7 @@ def calibrate_sequence(
             called after each frame.
 
     Raises:
-        InputError: If a frame cannot be read.
+        RunError: If a frame cannot be read.
         ConfigError: If the configuration does not map, or as `make_segmenter` raises it.
     """
     check_map_is_given(config)
@@ -74,7 +74,7 @@ def calibrate_sequence(
         pipeline = Pipeline(sequence, slam, evaluate_masks=False)
         record = pipeline(on_run(number, len(sequence)))
         if record.failure is not None:
-            raise InputError(record.failure)
+            raise RunError(record.failure)
         pipeline.flush()
         calibration = calibrate_camera(
             pipeline.slam.map,

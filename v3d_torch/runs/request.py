@@ -160,9 +160,10 @@ def read_request(folder: Path) -> RunRequest:
         options = parse_yaml(text)
         if not isinstance(options, dict):
             raise ValueError("it is not a mapping")
+        request = TypeAdapter(RunRequest).validate_python({**options, "config": Config()})
         if missing := set(RunRequest.__dataclass_fields__) - {"config"} - set(options):
             raise ValueError(f"it lacks {min(missing)}")
-        return TypeAdapter(RunRequest).validate_python({**options, "config": Config()})
+        return request
     except ValidationError as error:
         raise InputError(f"{path}: {first_error(error)}; run the sequence again") from error
     except ValueError as error:

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream
 from v3d_torch.datasets.tum_extents import describe_difference
-from v3d_torch.errors import InputError
+from v3d_torch.errors import RunError
 from v3d_torch.evaluation import Evaluation
 from v3d_torch.evaluation.evaluation import format_coverage, note_too_few_poses
 from v3d_torch.evaluation.outcome import label_sequence
@@ -65,15 +65,15 @@ def check_complete(folder: Path, pipeline: Pipeline) -> None:
     """Check that a run reached the end of its sequence with complete results.
 
     Raises:
-        InputError: If the run ended early, or its results are incomplete.
+        RunError: If the run ended early, or its results are incomplete.
     """
     record = pipeline.record
     if record.failure is not None:
         frames, fix = len(pipeline.slam.poses), way_to_resume(folder, pipeline.sequence)
         results = f"the results of the {frames} frames before are in {folder}{fix}"
-        raise InputError(f"{record.failure} ({results})")
+        raise RunError(f"{record.failure} ({results})")
     if record.diagnosis is not None:
-        raise InputError(f"{record.diagnosis} (the results are in {folder})")
+        raise RunError(f"{record.diagnosis} (the results are in {folder})")
 
 
 def way_to_resume(folder: Path, sequence: RGBDStream) -> str:

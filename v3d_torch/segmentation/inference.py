@@ -232,8 +232,7 @@ def open_session(path: Path, threads: int) -> onnxruntime.InferenceSession:
         return ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # the exceptions of onnxruntime have no common base class
         raise WeightsError(
-            f"{path}: is not a network that onnxruntime can load; delete the file or export it again, with its weights"
-            " in the same file"
+            f"{path}: is not a network that onnxruntime can load; delete the file or export it again"
         ) from error
 
 

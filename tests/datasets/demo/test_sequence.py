@@ -135,5 +135,5 @@ def test_interrupted_rendering_leaves_no_files(tmp_path: Path, monkeypatch: pyte
 
 def test_unwritable_cache_is_an_output_error(tmp_path: Path) -> None:
     (tmp_path / "cache").write_text("a file")
-    with pytest.raises(OutputError, match=r"cache: cannot store demo \(File exists\); free the disk"):
+    with pytest.raises(OutputError, match=r"cache: cannot store demo \(File exists\); set V3D_CACHE to another folder"):
         demo.ensure_demo(tmp_path / "cache")

@@ -142,8 +142,8 @@ CASES = [
         "a map of another room",
         all_of(load_map(), show_another_room),
         fails_after_run(
-            "{seq}/room.map: no frame of {seq} was localised in this map; pass a map of the same place, or run"
-            " without --load-map"
+            "{seq}/room.map: no frame of {seq} was localised in this map; pass a map of the same place, check the"
+            " depth_scale, or run without --load-map"
         ),
     ),
     Case(

@@ -132,7 +132,7 @@ CASES = [
     Case(
         "folder of the sequence",
         use_sequence_folder,
-        Fails("{seq}/groundtruth.txt: exists and was not written by a run; choose another folder with --out"),
+        Fails("{seq}: is the folder of the sequence; choose another folder with --out"),
     ),
     Case(
         "folder with a foreign map",
