@@ -91,7 +91,8 @@ def run_ablation_study(
 
     Raises:
         V3DError: If the input is invalid, if the folder contains an earlier study or a batch, or another study writes
-            to it, if the study was interrupted, or if a run failed. The results of the other runs are written.
+            to it, if the study was interrupted, or if a run failed or has incomplete results. The results of the other
+            runs are written.
     """
     console = wide_console()
     variant_configs = {variant: load_config(_find_variant(variant), overrides) for variant in variants}
@@ -119,6 +120,8 @@ def run_ablation_study(
     print_line(console, f"results: {folder}")
     if failed := [outcome for outcome in outcomes if outcome.failure is not None]:
         raise RunError(f"{len(failed)} of {len(outcomes)} runs failed, the first: {failed[0]}")
+    if incomplete := [outcome for outcome in outcomes if outcome.diagnosis is not None]:
+        raise RunError(f"{len(incomplete)} of {len(outcomes)} runs have incomplete results, the first: {incomplete[0]}")
 
 
 def _run_variants(

@@ -66,7 +66,6 @@ class LiveSLAM:
         source: Frames at their own rate: a camera (``open_source("realsense:")``), a `RealtimePlayback`, or any
             iterable that waits for its next frame, such as ``iter(queue.get, None)``.
         slam: System, made for the camera of the source.
-        clock: Clock of the computer.
 
     Attributes:
         dropped: Number of frames that were dropped so far.
@@ -76,7 +75,7 @@ class LiveSLAM:
         ConfigError: If the configuration does not allow threads (``prefetch=false``).
     """
 
-    def __init__(self, source: Iterable[RGBDFrame], slam: V3DSLAM, clock: Clock = MONOTONIC_CLOCK) -> None:
+    def __init__(self, source: Iterable[RGBDFrame], slam: V3DSLAM) -> None:
         if not slam.config.prefetch:
             raise ConfigError("prefetch=false: a live camera needs threads; remove --serial or set prefetch=true")
         if isinstance(source, RGBDSequence):
@@ -87,7 +86,7 @@ class LiveSLAM:
         self.slam = slam
         self.dropped = 0
         self._source = source
-        self._clock = clock
+        self._clock: Clock = MONOTONIC_CLOCK
         self._capture: FrameCapture | None = None
         self._rejected_before = 0  # by the captures before this one
         self._measured_at: float | None = None  # time at which the motion to the newest frame was measured
