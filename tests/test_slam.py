@@ -527,4 +527,9 @@ def test_state_without_a_part_is_an_error_that_names_it(demo: RGBDSequence) -> N
     assert len(with_occupancy.poses) == 0
     with pytest.raises(ConfigError, match=r"^the state lacks back_end, .*, up_estimator; load it with"):
         plain.load_state_dict({})
+    with pytest.raises(ConfigError, match=r"^the state has occupancy; load it with the configuration of its system$"):
+        plain.load_state_dict(with_occupancy.state_dict())
+    other = V3DSLAM(replace(plain.camera, fx=2 * plain.camera.fx), plain.segment, plain.config)
+    with pytest.raises(ConfigError, match=r"^the state is of another camera; load it into a system with the camera of"):
+        other.load_state_dict(plain.state_dict())
     assert len(plain.poses) == 1

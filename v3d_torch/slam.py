@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -363,6 +364,7 @@ class V3DSLAM(FramePreprocessor):
             ConfigError: If a stage was replaced by one without state_dict.
         """
         own = {
+            "camera": asdict(self.camera),
             "previous": self._previous,
             "predictions": list(self.predictions),
             "segmenter": self._segmenter_state,
@@ -377,7 +379,7 @@ class V3DSLAM(FramePreprocessor):
 
         Raises:
             ConfigError: If the state lacks a part or has another one, for example because it was saved without or with
-                an occupancy map, or if the segmenter cannot load its state.
+                an occupancy map, if it is of another camera, or if the segmenter cannot load its state.
         """
         own = self.state_dict().keys()
         for verb, names in (("lacks", own - state.keys()), ("has", state.keys() - own)):
@@ -385,6 +387,8 @@ class V3DSLAM(FramePreprocessor):
                 raise ConfigError(
                     f"the state {verb} {', '.join(sorted(names))}; load it with the configuration of its system"
                 )
+        if PinholeCamera(**state["camera"]) != self.camera:
+            raise ConfigError("the state is of another camera; load it into a system with the camera of its frames")
         self.back_end.discard()  # it reads the map
         for name, component in self._components_with_state().items():
             component.load_state_dict(state[name])
