@@ -29,7 +29,7 @@ MIN_INTERVAL = 0.01
 """Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
 each other come from a computer that received two frames at once, and the camera has moved for longer."""
 
-MAX_STAMP = 1e11
+_MAX_STAMP = 1e11
 """Maximum stamp of a frame, seconds, three thousand years: a larger one is in milliseconds or nanoseconds."""
 
 STAMP_TOLERANCE = 1e-3
@@ -142,7 +142,16 @@ def _check_times(index: int, stamp: float, depth_delay: float) -> None:
     for name, seconds in (("stamp", stamp), ("delay", depth_delay)):
         if not math.isfinite(to_float(seconds)):
             raise InputError(f"frame {index}: the {name} is {seconds!r}; give seconds, as a finite number")
-    if to_float(stamp) > MAX_STAMP:
+    check_unit_of_stamp(index, stamp)
+
+
+def check_unit_of_stamp(index: int, stamp: float) -> None:
+    """Check that the stamp of a frame is not in milliseconds or smaller units since 1970.
+
+    Raises:
+        InputError: If it is.
+    """
+    if to_float(stamp) > _MAX_STAMP:
         raise InputError(f"frame {index}: the stamp is {stamp!r}, in another unit or wrong; give seconds")
 
 

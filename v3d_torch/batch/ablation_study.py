@@ -102,8 +102,7 @@ def run_ablation_study(
         for variant, config in variant_configs.items()
         for seed in range(seeds)
     }
-    root = None if data_root is None else str(data_root)
-    requests = [RunRequest(name, Config(), data_root=root, camera=camera, fps=fps) for name in names]
+    requests = [RunRequest.of_sequence(name, data_root, camera=camera, fps=fps) for name in names]
     sequences = open_sequences(requests, console)
     network = cache(make_instance_source)
     first_camera = next(iter(sequences.values())).sequence.camera

@@ -89,14 +89,15 @@ def plan_jobs(
         folder: Folder of the batch. A run writes to ``<sequence>/<configuration>/seed<k>`` in it.
     """
     digests = {name: sequence_digest(opened.sequence) for name, opened in sequences.items()}
+    # Absolute, because another machine may have another working directory and environment.
+    requests = {name: opened.request.absolute() for name, opened in sequences.items()}
     return [
         Job(
             sequence=name,
             frames=len(opened.sequence),
             digest=digests[name],
             config_name=label,
-            # Absolute, because another machine may have another working directory and environment.
-            request=replace(opened.request, config=config.model_copy(update={"seed": seed})).absolute(),
+            request=replace(requests[name], config=config.model_copy(update={"seed": seed})),
             folder=folder.absolute() / folder_name(name) / label / f"seed{seed}",
         )
         for name, opened in sequences.items()

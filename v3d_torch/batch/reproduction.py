@@ -14,7 +14,6 @@ from v3d_torch.batch.plan import check_configs, load_configs, plan_jobs, prepare
 from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.runner import check_resume, run_missing_jobs
 from v3d_torch.batch.wide_console import wide_console
-from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL
 from v3d_torch.datasets import PAPER_SEQUENCES, short_name
 from v3d_torch.datasets.locate import data_folder, find_stored
@@ -166,7 +165,7 @@ def _open_paper_sequences(
         if not download and find_stored(name, data_root) is None:
             missing.append(full_name)
             continue
-        request = RunRequest(name, Config(), data_root=None if data_root is None else str(data_root))
+        request = RunRequest.of_sequence(name, data_root)
         try:
             sequence = open_sequence(request, console)
         except DownloadError as error:

@@ -16,7 +16,6 @@ from v3d_torch.batch.process_executor import ProcessExecutor
 from v3d_torch.batch.progress import BatchProgress
 from v3d_torch.batch.ray_executor import RayExecutor
 from v3d_torch.batch.wide_console import wide_console
-from v3d_torch.config import Config
 from v3d_torch.datasets.sequence_patterns import matching_sequences
 from v3d_torch.errors import InputError, OutputError, RunError
 from v3d_torch.runs.interrupts import interrupts_between_frames
@@ -56,9 +55,8 @@ def run_batch(
     for note in matches.notes:
         print_line(console, f"note: {note}")
     executor: Executor = ProcessExecutor(workers or 1) if ray is None else RayExecutor(ray, workers)
-    root = None if data_root is None else str(data_root)
     requests = [
-        RunRequest(seq, Config(), data_root=root, camera=camera, fps=fps, skip_broken=skip_broken)
+        RunRequest.of_sequence(seq, data_root, camera=camera, fps=fps, skip_broken=skip_broken)
         for seq in matches.sequences
     ]
     sequences = open_sequences(requests, console)

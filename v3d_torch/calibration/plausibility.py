@@ -28,7 +28,8 @@ _FIRST_VIEWS, _MAX_VIEWS = 8, 32
 accurate estimate if these do not seem to fit."""
 
 _SUSPICION = 0.5
-"""Fraction of the following limits above which a first, inaccurate estimate is followed by a more accurate one."""
+"""Fraction of the limits of shift and delay above which a first, inaccurate estimate is followed by a more accurate
+one."""
 
 _MIN_DELAY = 0.05
 """Minimum delay of depth that is reported, seconds: more than half a frame period, the maximum delay of cameras without

@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from v3d_torch.errors import InputError
 from v3d_torch.io.files import write_text
 from v3d_torch.io.text_file import numbered_lines, replace_odd_spaces
-from v3d_torch.io.timestamps import parse_timestamp
+from v3d_torch.io.timestamps import format_timestamp, parse_timestamp
 
 _LOG = logging.getLogger(__name__)
 
@@ -41,7 +41,9 @@ def write_gravity_file(folder: Path, stamp: float, gravity: Tensor) -> None:
         OutputError: If the file cannot be written.
     """
     vector = " ".join(f"{value:.9f}" for value in gravity.tolist())
-    write_text(folder / GRAVITY_FILE, f"# {_COLUMNS}: unit vector in the camera frame\n{stamp:.6f} {vector}\n")
+    write_text(
+        folder / GRAVITY_FILE, f"# {_COLUMNS}: unit vector in the camera frame\n{format_timestamp(stamp)} {vector}\n"
+    )
 
 
 def read_gravity_file(path: Path, first_stamp: float) -> Tensor | None:

@@ -18,7 +18,7 @@ from v3d_torch.io.files import write_text
 from v3d_torch.io.numbers import parse_number
 from v3d_torch.io.paths import StrPath
 from v3d_torch.io.text_file import lines_and_comments, replace_odd_spaces
-from v3d_torch.io.timestamps import MIN_NANOSECONDS, parse_timestamp, round_timestamp
+from v3d_torch.io.timestamps import MIN_NANOSECONDS, format_timestamp, parse_timestamp, round_timestamp
 from v3d_torch.types import Trajectory
 
 MAX_DISTANCE = 1e7
@@ -135,7 +135,7 @@ def write_trajectory(path: StrPath, trajectory: Trajectory, *, comment: str | No
         quaternions = Rotation.from_matrix(T_wc[:, :3, :3]).as_quat(canonical=True)
         poses = np.concatenate([T_wc[:, :3, 3], quaternions], axis=1).round(9) + 0.0  # + 0.0: no "-0.000000000"
         lines += [
-            f"{stamp:.6f} " + " ".join(f"{value:.9f}" for value in pose) + "\n"
+            f"{format_timestamp(stamp)} " + " ".join(f"{value:.9f}" for value in pose) + "\n"
             for stamp, pose in zip(stamps, poses.tolist(), strict=True)
         ]
     write_text(Path(path), "".join(lines))

@@ -13,6 +13,7 @@ from v3d_torch.datasets.tum_trajectory import write_trajectory
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import SATURATED_DEPTH, depth_to_units
 from v3d_torch.io.files import append_line, check_empty_folder, check_writable, write_png, write_text
+from v3d_torch.io.timestamps import format_timestamp
 from v3d_torch.types import RGBDFrame, Trajectory
 
 _LOG = logging.getLogger(__name__)
@@ -78,7 +79,7 @@ class TUMWriter:
             self._write_camera()
             if frame.gravity is not None:
                 write_gravity_file(self.folder, frame.stamp, frame.gravity)
-        rgb, depth = f"{frame.stamp:.6f}", f"{frame.stamp + frame.depth_delay:.6f}"
+        rgb, depth = format_timestamp(frame.stamp), format_timestamp(frame.stamp + frame.depth_delay)
         is_taken = (self.folder / "depth" / f"{depth}.png").exists()  # by an earlier frame: the folder was empty
         depth_name = f"{depth}_{rgb}" if is_taken else depth
         listed_rgb, listed_depth = f"{rgb} rgb/{rgb}.png", f"{depth} depth/{depth_name}.png"

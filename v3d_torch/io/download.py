@@ -154,8 +154,7 @@ def _verify_part(url: str, part: Path, sha256: str | None, size: int | None) -> 
 def _cause(error: BaseException) -> str:
     """Short cause of an error, without the text that urllib adds."""
     cause = getattr(error, "reason", error)
-    text = str(getattr(cause, "strerror", None) or cause or type(error).__name__)
-    return text.strip().splitlines()[0] if text.strip() else type(error).__name__
+    return " ".join(str(getattr(cause, "strerror", None) or cause or type(error).__name__).split())
 
 
 class _HttpsRedirects(urllib.request.HTTPRedirectHandler):

@@ -20,11 +20,12 @@ from v3d_torch.errors import NumericsError
 from v3d_torch.frame_result import Extraction, FrameResult, PreprocessedFrame, Segmentation
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
 from v3d_torch.slam import V3DSLAM
+from v3d_torch.stages.replaceable_stages import INNER_STAGES
 from v3d_torch.stages.stage_checks import RESULTS
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_CHECKED = {"segment", *RESULTS, "estimate_motion", "track_map", "loop_closer"} - {"motion_model"}
+_CHECKED = {"segment", *RESULTS, *INNER_STAGES} - {"motion_model"}
 """Names of the stages whose results are checked. Motion model and map have other checks."""
 
 MAY_BE_NAN = frozenset(

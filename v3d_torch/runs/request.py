@@ -70,6 +70,19 @@ class RunRequest:
     realtime: bool = False
     skip_broken: bool = False
 
+    @staticmethod
+    def of_sequence(
+        seq: str,
+        data_root: Path | None,
+        *,
+        camera: str | None = None,
+        fps: float | None = None,
+        skip_broken: bool = False,
+    ) -> RunRequest:
+        """Make the request for a sequence that runs with several configurations; its own is the default."""
+        root = None if data_root is None else str(data_root)
+        return RunRequest(seq, Config(), data_root=root, camera=camera, fps=fps, skip_broken=skip_broken)
+
     def open_source(self, progress: Progress | None = None) -> RGBDStream:
         """Open the source of frames, see `v3d_torch.datasets.open_source`."""
         return open_source(self.seq, progress=progress, **self._source_options())

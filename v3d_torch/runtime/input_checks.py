@@ -16,7 +16,7 @@ from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_units import implausible_median
 from v3d_torch.io.timestamps import round_timestamp
 from v3d_torch.runtime.value_rules import FINITE, FRACTIONS, Rule
-from v3d_torch.types import MAX_STAMP, Instances, RGBDFrame
+from v3d_torch.types import Instances, RGBDFrame, check_unit_of_stamp
 
 _MAX_NORM_ERROR = 1e-3
 """Maximum difference between the length of a unit vector and 1."""
@@ -99,8 +99,7 @@ def check_frame(frame: RGBDFrame, camera: PinholeCamera) -> None:
     for name, seconds in times.items():
         if not isinstance(seconds, Real) or not math.isfinite(seconds):
             raise InputError(f"frame {frame.index}: the {name} is {seconds!r}; give a finite number of seconds")
-    if frame.stamp > MAX_STAMP:
-        raise InputError(f"frame {frame.index}: the stamp is {frame.stamp!r}, in another unit or wrong; give seconds")
+    check_unit_of_stamp(frame.index, frame.stamp)
     gravity = frame.gravity
     if gravity is not None:
         wrong = describe_wrong_tensor(gravity, (3,), torch.float64)

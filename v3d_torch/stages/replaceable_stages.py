@@ -21,7 +21,7 @@ from v3d_torch.stages.stage_checks import RESULTS, ReplacedStage
 _TRAINING_LAYERS = (torch.nn.modules.dropout._DropoutNd, torch.nn.modules.batchnorm._NormBase)
 """Base classes of the layers whose results in training mode depend on chance or on earlier calls."""
 
-_INNER_STAGES = {
+INNER_STAGES = {
     "estimate_motion": "odometry",
     "track_map": "track_camera",
     "loop_closer": "track_camera and back_end",
@@ -52,9 +52,9 @@ class ReplaceableStages:
                 if the name is that of no attribute but similar to that of a stage, or if the attribute is used inside
                 another stage only, so that its replacement would have no effect.
         """
-        if name in _INNER_STAGES and name in vars(self):
+        if name in INNER_STAGES and name in vars(self):
             raise ConfigError(
-                f"{name} cannot be replaced, because it is used inside {_INNER_STAGES[name]}; replace that instead"
+                f"{name} cannot be replaced, because it is used inside {INNER_STAGES[name]}; replace that instead"
             )
         if not hasattr(self, name) and name not in (*STAGES, *RESULTS):
             for stage in get_close_matches(name, STAGES, n=1, cutoff=_SIMILARITY):

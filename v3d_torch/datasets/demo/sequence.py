@@ -17,6 +17,7 @@ from v3d_torch.datasets.demo.scene import Scene
 from v3d_torch.datasets.demo.scenes import SCENES
 from v3d_torch.datasets.demo.sensor_model import simulate_colour, simulate_depth
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.timestamps import format_timestamp
 
 CAMERA = PinholeCamera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, depth_scale=5000.0, readout=0.0)
 """Default calibration of a Kinect, with a global shutter: all rows of a rendered image have the same time."""
@@ -69,7 +70,7 @@ def _single_thread() -> Iterator[None]:
 
 
 def _stamp(index: int) -> str:
-    return f"{START_STAMP + index / FRAME_RATE:.6f}"
+    return format_timestamp(START_STAMP + index / FRAME_RATE)
 
 
 def _write_frame(folder: Path, renderer: Renderer, index: int) -> None:

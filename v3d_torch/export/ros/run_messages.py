@@ -148,7 +148,7 @@ class RunMessages:
         odometry_frame, state = self._odometry_frame, slam.states.at(stamp)
         newest = len(slam.poses) - 1
         known = [*self._last, newest]
-        T_cw = slam.poses.poses_of([known[0]] * (3 - len(known)) + known)
+        T_cw = slam.poses.poses_of([known[0]] * (3 - len(known)) + known)  # the first also stands for those before it
         odometry_frame.update(*frames.camera_in_map(invert(T_cw), self._T_mw))
         self._last = known[-2:]
         yield "/tf", self._tree(stamp)
