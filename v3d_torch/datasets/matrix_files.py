@@ -1,4 +1,4 @@
-"""Matrices in files: plain text (ScanNet, 7-Scenes) and OpenCV's YAML (OpenLORIS-Scene)."""
+"""Matrices in files: plain text (ScanNet, 7-Scenes, Replica) and OpenCV's YAML (OpenLORIS-Scene)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import are_rigid
 from v3d_torch.io.numbers import parse_number
 from v3d_torch.io.safe_yaml import parse_yaml, to_valid_yaml
-from v3d_torch.io.text_file import lines_and_comments, read_text, replace_odd_spaces
+from v3d_torch.io.text_file import lines_and_comments, numbered_lines, read_text, replace_odd_spaces
 from v3d_torch.types import Trajectory
 
 
@@ -72,16 +72,51 @@ def read_poses(files: Mapping[float, Path]) -> GroundTruth | None:
         matrix = _to_matrix(path, lines)
         if matrix.shape != (4, 4):
             raise InputError(f"{path}: is not a 4x4 pose matrix; copy it again")
-        if not np.isfinite(matrix).all():
-            continue
-        if np.abs(matrix).max() > MAX_DISTANCE or not are_rigid(torch.from_numpy(matrix), ROTATION_TOLERANCE):
-            raise InputError(f"{path}: is not a valid rigid transform; copy it again")
-        poses[stamp] = matrix
+        if _is_measured(matrix, str(path)):
+            poses[stamp] = matrix
     if not files:
         return None
+    return _to_groundtruth(poses, len(files))
+
+
+def read_pose_lines(path: Path, rate: float) -> GroundTruth:
+    """Read camera poses from a text file with one 4x4 matrix per line, in row-major order.
+
+    Args:
+        path: File whose line i, from 0, is the pose of frame i.
+        rate: Frame rate, Hz: converts frame numbers to timestamps.
+
+    Returns:
+        Camera-to-world poses. Poses that are not finite mark lost tracking and are left out.
+
+    Raises:
+        InputError: If the file cannot be read, or a line is not a rigid transform.
+    """
+    poses, lines = {}, list(numbered_lines(path, "each line is a 4x4 matrix of 16 numbers"))
+    for frame, (number, line) in enumerate(lines):
+        try:
+            matrix = np.array([parse_number(word) for word in line.replace(",", " ").split()]).reshape(4, 4)
+        except ValueError as error:
+            raise InputError(f"{path}: line {number} is not a 4x4 matrix of 16 numbers; copy it again") from error
+        if _is_measured(matrix, f"{path}: line {number}"):
+            poses[frame / rate] = matrix
+    return _to_groundtruth(poses, len(lines))
+
+
+def _is_measured(matrix: NDArray[np.float64], source: str) -> bool:
+    """Check whether a pose, shape (4, 4), is finite; raise InputError if it is finite but no rigid transform."""
+    if not np.isfinite(matrix).all():
+        return False
+    if np.abs(matrix).max() > MAX_DISTANCE or not are_rigid(torch.from_numpy(matrix), ROTATION_TOLERANCE):
+        raise InputError(f"{source}: is not a valid rigid transform; copy it again")
+    return True
+
+
+def _to_groundtruth(poses: Mapping[float, NDArray[np.float64]], count: int) -> GroundTruth:
+    """Return the poses by their timestamps as ground truth, of which there were ``count`` with those left out."""
     stamps = torch.tensor(list(poses), dtype=torch.float64)
     T_wc = torch.from_numpy(np.array(list(poses.values()), dtype=np.float64).reshape(-1, 4, 4))
-    return GroundTruth(Trajectory(stamps, T_wc), missing=len(files) - len(poses))
+    return GroundTruth(Trajectory(stamps, T_wc), missing=count - len(poses))
 
 
 def read_opencv_yaml(path: Path) -> Any:

@@ -9,11 +9,13 @@ from pathlib import Path
 from v3d_torch.datasets.base import RGBDStream
 from v3d_torch.datasets.bonn import BonnSequence, is_bonn
 from v3d_torch.datasets.cameras import CameraChoice
+from v3d_torch.datasets.eth3d import ETH3DSequence, is_eth3d
 from v3d_torch.datasets.icl_nuim import ICLNUIMSequence, is_icl_nuim
 from v3d_torch.datasets.image_folder import ImageFolder, is_image_folder
 from v3d_torch.datasets.locate import is_tum
 from v3d_torch.datasets.openloris import OpenLORISSequence, is_openloris
 from v3d_torch.datasets.realsense import is_realsense_recording, open_realsense_recording
+from v3d_torch.datasets.replica import ReplicaSequence, is_replica
 from v3d_torch.datasets.ros import BagSequence, is_bag
 from v3d_torch.datasets.scannet import ScanNetSequence, is_scannet
 from v3d_torch.datasets.seven_scenes import SevenScenesSequence, is_seven_scenes
@@ -74,8 +76,10 @@ SOURCES = (
     Source("an OpenLORIS-Scene package", is_openloris, lambda path, camera, *_: OpenLORISSequence(path, camera)),
     Source("an ICL-NUIM sequence", is_icl_nuim, lambda path, camera, *_: ICLNUIMSequence(path, camera)),
     Source("a Bonn RGB-D Dynamic sequence", is_bonn, lambda path, camera, *_: BonnSequence(path, camera)),
+    Source("an ETH3D sequence", is_eth3d, lambda path, camera, *_: ETH3DSequence(path, camera)),
     Source("a folder in TUM layout", is_tum, lambda path, camera, *_: TUMSequence(path, camera)),
     Source("a 7-Scenes sequence", is_seven_scenes, lambda path, camera, *_: SevenScenesSequence(path, camera)),
+    Source("a Replica sequence", is_replica, lambda path, camera, *_: ReplicaSequence(path, camera)),
     Source("a ScanNet export", is_scannet, lambda path, camera, *_: ScanNetSequence(path, camera)),
     Source(
         "a video",

@@ -150,6 +150,7 @@ class Pipeline:
 
         Call this after the last frame.
         """
+        trim_memory()  # so that results do not add to memory that tracking no longer needs
         self.slam.flush()
         if not self.record.was_checked:
             self._check_plausibility()
@@ -176,7 +177,6 @@ class Pipeline:
         Returns:
             Point map of the static scene, fused from the views whose place in the map is known.
         """
-        trim_memory()  # so that fusion and figures do not add to memory that tracking no longer needs
         point_map = fuse_points(self.views.connected(), self.slam.config)
         try:
             self._viewer.finish(self.slam, point_map)

@@ -84,12 +84,12 @@ def draw_objects(axes: Axes, image: Tensor, objects: Sequence[Overlay]) -> None:
         image: Image, uint8 RGB, shape :math:`(3, H, W)`.
         objects: Masks, labels and motion states; an empty label is not drawn.
     """
-    picture = image.permute(1, 2, 0).numpy().astype(np.float32) / 255
+    picture = image.permute(1, 2, 0).numpy().copy()
     outlines = []
     for mask, _, motion_state in objects:
         colour = MOTION_STATE_COLOURS[parse_motion_state(motion_state)]
         inside = mask.numpy()
-        picture[inside] = (1 - _TINT) * picture[inside] + _TINT * np.array(to_rgb(colour), dtype=np.float32)
+        picture[inside] = np.rint((1 - _TINT) * picture[inside] + _TINT * 255 * np.array(to_rgb(colour)))
         contours, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         outlines += [(np.concatenate([contour[:, 0], contour[:1, 0]]), colour) for contour in contours]
     axes.imshow(picture, interpolation="antialiased")

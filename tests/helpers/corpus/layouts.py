@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 
 import numpy as np
@@ -64,6 +65,17 @@ def seven_scenes() -> dict[str, bytes]:
         name = f"frame-{i:06d}"
         files |= {f"{name}.color.png": png(colour(*camera_position(i))), f"{name}.depth.png": MILLIMETRES}
         files[f"{name}.pose.txt"] = pose(i).encode()
+    return files
+
+
+def replica() -> dict[str, bytes]:
+    """Files of the sequence in the layout of the sequences rendered from Replica."""
+    camera = {"w": WIDTH, "h": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": (WIDTH - 1) / 2, "cy": (HEIGHT - 1) / 2}
+    files = {"cam_params.json": json.dumps({"camera": camera | {"scale": 1000.0}}).encode()}
+    files["traj.txt"] = "".join(pose(i).replace("\n", " ") + "\n" for i in range(FRAMES)).encode()
+    for i in range(FRAMES):
+        files[f"results/frame{i:06d}.png"] = png(colour(*camera_position(i)))
+        files[f"results/depth{i:06d}.png"] = MILLIMETRES
     return files
 
 
@@ -165,6 +177,12 @@ CASES = [
         "7-Scenes, colour without depth",
         use_files(without(seven_scenes(), *(f"frame-{i:06d}.depth" for i in range(1, FRAMES)))),
         Succeeds(1, max_ate=None),
+    ),
+    Case("Replica", use_files(replica()), Succeeds()),
+    Case(
+        "Replica, truncated poses",
+        changed(replica(), "traj.txt", first_half),
+        fails_after_run("{root}/take/traj.txt: line ... is not a 4x4 matrix of 16 numbers; copy it again"),
     ),
     Case(
         "ICL-NUIM, truncated ground truth",
