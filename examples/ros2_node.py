@@ -4,13 +4,14 @@
 ``camera/aligned_depth_to_color/image_raw``; other names are given by ``--ros-args -r OLD:=NEW``. It publishes ``/tf``,
 ``/odom``, ``/objects``, ``/cloud``, ``/path`` (see `v3d_torch.export.ros.run_messages`) and, every few seconds,
 ``/map``. The camera driver should not publish transforms of its own (``publish_tf:=false``). Parameters: ``config``,
-name or file of a configuration; ``set``, list of values, ``occupancy.enabled=true`` if not given, as ``/map`` needs.
+name or file of a configuration; ``set``, list of values, by default ``occupancy.enabled=true``, which ``/map`` needs.
 It has not been tried with an installed ROS: the tests run it with stand-ins for the modules of ROS.
 """
 
 from __future__ import annotations
 
 import gc
+from contextlib import suppress
 from queue import SimpleQueue
 from threading import Thread
 
@@ -60,11 +61,9 @@ class SlamNode(Node):
 
     def publish_result(self, result: v3d.LiveResult) -> None:
         """Publish the messages of a tracked frame, and sometimes the grid."""
-        for topic, message in self._messages.of_frame(result.frame, result, self.slam):
+        grid = self._messages.of_grid(self.slam) if len(self.slam.poses) % GRID_INTERVAL == 0 else ()
+        for topic, message in (*self._messages.of_frame(result.frame, result, self.slam), *grid):
             if not topic.endswith("camera_info"):  # the driver publishes it
-                self._publish(topic, message)
-        if len(self.slam.poses) % GRID_INTERVAL == 0:
-            for topic, message in self._messages.of_grid(self.slam):
                 self._publish(topic, message)
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
@@ -86,13 +85,14 @@ class SlamNode(Node):
 
 
 def main() -> None:
-    """Run until ROS is shut down."""
+    """Run until ROS is shut down, for example by Ctrl-C."""
     gc.freeze()  # later searches for garbage leave out the objects of the imports, which would take 0.2 s
     rclpy.init()
     torch.set_num_threads(1)  # more threads mostly wait for each other
     node = SlamNode()
     Thread(target=node.receive, daemon=True).start()
-    v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)
+    with suppress(KeyboardInterrupt):
+        v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)
 
 
 if __name__ == "__main__":

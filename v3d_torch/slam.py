@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import partial
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -103,8 +103,8 @@ class V3DSLAM(FramePreprocessor):
 
     Raises:
         WeightsError: If the weights of the network are not available.
-        ConfigError: If a parameter has the wrong type, or if a stage that the configuration names by its import path
-            cannot be made, see `StagesConfig`.
+        ConfigError: If a parameter has the wrong type, the known map is of another camera, or a stage that the
+            configuration names by its import path cannot be made, see `StagesConfig`.
         InputError: If the lens model of the camera maps no ray in front of the camera to some pixels.
     """
 
@@ -118,6 +118,8 @@ class V3DSLAM(FramePreprocessor):
         super().__init__(camera, segment, config)
         if not isinstance(known_map, SparseMap | None):
             raise ConfigError(f"V3DSLAM needs a SparseMap, got a {type(known_map).__name__}; give load_map(...).map")
+        if known_map is not None and known_map.camera != camera:
+            raise ConfigError("the known map was loaded for another camera; load it with the camera of the frames")
         config = self.config
         self.timer = StageTimer()
         self.map = SparseMap.empty(config, camera) if known_map is None else known_map
@@ -163,6 +165,10 @@ class V3DSLAM(FramePreprocessor):
         super().__setattr__(name, value)
         if name == "segment":
             self._segmenter_state = segmenter_state_of(value)
+
+    def __reduce__(self) -> NoReturn:
+        """Raise TypeError: a system cannot be pickled or copied, but its state can be saved, see `save_state`."""
+        raise TypeError("V3DSLAM cannot be pickled or copied; use save_state, and load_state with a new V3DSLAM")
 
     @property
     def gravity(self) -> Tensor | None:

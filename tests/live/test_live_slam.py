@@ -316,6 +316,23 @@ def test_second_loop_with_earlier_frames_is_an_input_error(is_same: bool) -> Non
         next(iter(again))
 
 
+def test_source_that_is_not_iterable_is_rejected() -> None:
+    source: Any = Wall()[0]
+    with pytest.raises(InputError, match="LiveSLAM needs an iterable of frames, got a RGBDFrame"):
+        LiveSLAM(source, V3DSLAM(CAMERA, square))
+
+
+def test_second_loop_beside_the_first_is_rejected() -> None:
+    source, _ = feed()
+    live = LiveSLAM(source, V3DSLAM(CAMERA, square))
+    first = iter(live)
+    next(first)
+    with pytest.raises(InputError, match="another loop over this LiveSLAM has not ended; leave it first"):
+        next(iter(live))
+    first.close()
+    assert live.slam.poses.stamp == Wall()[0].stamp
+
+
 def test_configuration_without_threads_is_rejected() -> None:
     with pytest.raises(ConfigError, match="prefetch=false: a live camera needs threads; remove --serial"):
         LiveSLAM(iter(()), V3DSLAM(CAMERA, square, Config(prefetch=False)))

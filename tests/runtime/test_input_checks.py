@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -11,9 +13,11 @@ import numpy as np
 import pytest
 import torch
 
+from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Instances, RGBDFrame
@@ -204,3 +208,15 @@ def test_stored_map_in_place_of_its_map_is_named() -> None:
     known: Any = object()
     with pytest.raises(ConfigError, match=r"V3DSLAM needs a SparseMap, got a object; give load_map\(...\)\.map"):
         V3DSLAM(CAMERA, lambda _: INSTANCES, known_map=known)
+
+
+def test_known_map_of_another_camera_is_rejected() -> None:
+    known = SparseMap.empty(Config(), replace(CAMERA, fx=CAMERA.fx + 1))
+    with pytest.raises(ConfigError, match="the known map was loaded for another camera; load it with the camera of"):
+        V3DSLAM(CAMERA, lambda _: INSTANCES, known_map=known)
+
+
+@pytest.mark.parametrize("function", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_system_can_be_neither_copied_nor_pickled(function: Callable[[V3DSLAM], object]) -> None:
+    with pytest.raises(TypeError, match="cannot be pickled or copied; use save_state, and load_state with a new"):
+        function(make_slam())

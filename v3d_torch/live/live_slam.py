@@ -71,7 +71,7 @@ class LiveSLAM:
         dropped: Number of frames that were dropped so far.
 
     Raises:
-        InputError: If the source is a stored sequence, whose frames do not come at their own rate.
+        InputError: If the source is a stored sequence, whose frames do not come at their own rate, or not iterable.
         ConfigError: If the configuration does not allow threads (``prefetch=false``).
     """
 
@@ -83,11 +83,14 @@ class LiveSLAM:
                 f"{source.name}: is stored, and most of its frames would be dropped; wrap it in RealtimePlayback, or"
                 " call slam(frame) for each frame"
             )
+        if not isinstance(source, Iterable):
+            raise InputError(f"LiveSLAM needs an iterable of frames, got a {type(source).__name__}")
         self.slam = slam
         self.dropped = 0
         self._source = source
         self._clock: Clock = MONOTONIC_CLOCK
         self._capture: FrameCapture | None = None
+        self._is_running = False
         self._rejected_before = 0  # by the captures before this one
         self._measured_at: float | None = None  # time at which the motion to the newest frame was measured
 
@@ -102,10 +105,46 @@ class LiveSLAM:
         The frames that are being captured and preprocessed when the loop is left are discarded, and not counted.
 
         Raises:
-            InputError: If the source ends with an error, a frame is not valid, or the first one is not later than the
-                frames that the system has tracked.
+            InputError: If another loop over this object has not ended, the source ends with an error, a frame is not
+                valid, or the first one is not later than the frames that the system has tracked.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
+        if self._is_running:
+            raise InputError("another loop over this LiveSLAM has not ended; leave it first")
+        self._is_running = True
+        try:
+            yield from self._run()
+        finally:
+            self._is_running = False
+
+    def __call__(self, on_result: Callable[[LiveResult], object]) -> None:
+        """Run until the source ends, and call back with each result.
+
+        Args:
+            on_result: Called in this thread. If it takes long, frames are dropped.
+
+        Raises:
+            InputError: As for iteration.
+            ConfigError: As for iteration.
+        """
+        for result in self:
+            on_result(result)
+
+    def stop(self) -> None:
+        """End the iteration; can be called from any thread. It has no effect on an iteration that has not begun.
+
+        Frames that already wait are still tracked. A `LiveStream` is stopped. Any other source has to end by itself;
+        the iteration ends without it, after a wait of two seconds, and its thread waits for its next frame.
+        """
+        if self._capture is not None:
+            self._capture.stop()
+
+    def pose_at(self, stamp: float) -> CameraState:
+        """Return the state of the camera at a time, see `V3DSLAM.pose_at`; can be called from any thread."""
+        return self.slam.pose_at(stamp)
+
+    def _run(self) -> Generator[LiveResult, None, None]:
+        """Start the source and yield the result of each tracked frame, see `__iter__`."""
         self._rejected_before = self.rejected
         self._capture = capture = FrameCapture(self._source, self.slam.check, self._clock)
         _warm_up(self.slam)
@@ -135,32 +174,6 @@ class LiveSLAM:
                 )
                 trim_memory_at_intervals(len(self.slam.poses))
             self.slam.flush()
-
-    def __call__(self, on_result: Callable[[LiveResult], object]) -> None:
-        """Run until the source ends, and call back with each result.
-
-        Args:
-            on_result: Called in this thread. If it takes long, frames are dropped.
-
-        Raises:
-            InputError: As for iteration.
-            ConfigError: As for iteration.
-        """
-        for result in self:
-            on_result(result)
-
-    def stop(self) -> None:
-        """End the iteration; can be called from any thread. It has no effect on an iteration that has not begun.
-
-        Frames that already wait are still tracked. A `LiveStream` is stopped. Any other source has to end by itself;
-        the iteration ends without it, after a wait of two seconds, and its thread waits for its next frame.
-        """
-        if self._capture is not None:
-            self._capture.stop()
-
-    def pose_at(self, stamp: float) -> CameraState:
-        """Return the state of the camera at a time, see `V3DSLAM.pose_at`; can be called from any thread."""
-        return self.slam.pose_at(stamp)
 
     def _check_first(self, frame: RGBDFrame) -> None:
         """Raise InputError if the first frame of a loop is not later than the frames that the system has tracked."""
