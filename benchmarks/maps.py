@@ -52,7 +52,7 @@ def run(sequence: RGBDSequence) -> tuple[V3DSLAM, StaticViews, dict[str, StaticV
     views, masked, unmasked = (StaticViews(sequence.camera, config.dense_map.stride) for _ in range(3))
     for frame in sequence:
         objects = slam(frame)
-        keyframe = slam.map.keyframe_at(frame.stamp)
+        keyframe = slam.map.newest_keyframe_at(frame.stamp)
         if keyframe is None:
             continue
         truth = sequence.motion_mask(frame.index) if isinstance(sequence, HasMotionMasks) else None

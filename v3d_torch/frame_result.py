@@ -23,11 +23,14 @@ class Segmentation:
         instances: Instances of the frame; None if the frame was not segmented.
         segmenter_state: State of the segmenter after this frame; None if it has no state.
         times: Time that each stage took.
+        up_votes: Votes for the up direction after this frame, see `UprightSegmenter.up_votes`; None if the segmenter is
+            another one.
     """
 
     instances: Instances | None
     segmenter_state: dict[str, Any] | None
     times: dict[str, StageTime]
+    up_votes: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class PreprocessedFrame:
 
     @property
     def segmentation(self) -> Segmentation:
-        """Instances of the frame. Waits for the segmentation if it is not complete yet."""
+        """Segmentation of the frame; waits until it is complete."""
         return self.wait_for_segmentation()
 
 

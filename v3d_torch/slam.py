@@ -45,7 +45,6 @@ from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation import NoSegmentation
 from v3d_torch.segmentation.segmenter import innermost_segmenter, restore_segmenter, segmenter_state_of
-from v3d_torch.segmentation.upright import up_votes
 from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES, FramePreprocessor
 from v3d_torch.stages.protocols import (
     AppearanceStage,
@@ -79,9 +78,9 @@ class V3DSLAM(FramePreprocessor):
     """Tracks an RGB-D camera, maps the static scene and classifies the motion of objects.
 
     `preprocess` runs the stages that can run ahead of tracking, see `FramePreprocessor`; `track` runs the others. Every
-    stage is an attribute and can be replaced by an object with the same methods; results of replaced stages that other
-    stages use are checked. Only `estimate_motion`, `track_map` and `loop_closer` cannot be replaced alone, because
-    other stages call them. Hooks get the arguments and results of stages, see `register_stage_hook`.
+    stage is an attribute. All but `estimate_motion`, `track_map` and `loop_closer`, which other stages call, can be
+    replaced by an object with the same methods; results of replaced stages are checked where other stages use them.
+    Hooks get the arguments and results of stages, see `register_stage_hook`.
 
     Args:
         camera: Camera of all frames.
@@ -265,14 +264,17 @@ class V3DSLAM(FramePreprocessor):
         with self.timer("tracking"):  # III-E: camera pose in the local map, from static features
             is_static = features.in_mask(objects.static_mask)
             static = self._compensate(preprocessed.extraction.features[is_static], preprocessed, motion.velocity)
-            landmarks = motion.propagate_landmarks(self._previous, len(features))[is_static]
+            propagated = motion.propagate_landmarks(self._previous, len(features))[is_static]
             previous_velocity = self.motion_model.previous_velocity(self.poses, motion)
             self.refine_previous(self._previous, previous_velocity, self.poses, self.compensate)
-            pose = self.track_camera(static, depth, self._compose_pose(motion), landmarks, motion, self.poses)
-            owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
+            pose = self.track_camera(static, depth, self._compose_pose(motion), propagated, motion, self.poses)
             self.motion_model.update(self.poses, frame.stamp, pose, motion)
         with self.timer("mapping"):  # III-E: keyframes and landmarks
-            keyframe = self._extend_map(frame, static, pose, motion)
+            reference = self.track_camera.reference_keyframe(pose, self.poses)
+            keyframe = self.mapper(frame, static, pose, reference)
+            self._append_pose(frame, pose, motion, reference, keyframe)
+            if keyframe is not None:
+                self.back_end.submit(keyframe)
             if view is not None and pose.status is not TrackingStatus.LOST:
                 T_dw = T_dc @ self.poses.T_cw
                 self.free_space_check.add_view(view, T_dw)
@@ -280,6 +282,7 @@ class V3DSLAM(FramePreprocessor):
             landmarks = pose.landmarks if keyframe is None else keyframe.landmarks
             self._previous = TrackedFrame(frame, depth, static, objects.static_mask, landmarks)
         with self.timer("tracking"):  # covariance of the pose, twist of the camera
+            owners = self.map.landmarks["keyframe"][pose.observed_landmarks]
             references = None if keyframe is None else self.map.references
             state = self.estimate_state(pose, motion, self.poses, owners, references)
             self.states.append(state)
@@ -435,7 +438,7 @@ class V3DSLAM(FramePreprocessor):
         self._segmenter_state = segmentation.segmenter_state
         if segmentation.instances is not None:
             self._last_segmented_tracked = preprocessed.frame.index
-        self.up_estimator.votes = up_votes(segmentation.segmenter_state)
+        self.up_estimator.votes = segmentation.up_votes
         self.timer.add(segmentation.times)
         return segmentation
 
@@ -449,22 +452,22 @@ class V3DSLAM(FramePreprocessor):
             return instances
         return instances.concatenate(self.propose_unlabelled(appeared_pixels, instances, view.depth))
 
-    def _extend_map(
-        self, frame: RGBDFrame, features: Features, pose: FramePose, motion: CameraMotion
-    ) -> Keyframe | None:
-        """Append the pose of a frame, and insert the frame into the map if the map needs a keyframe; return it."""
-        part, reference = self.poses.part, self.track_camera.reference_keyframe(pose, self.poses)
-        predicted_T_cw = self._compose_pose(motion)  # includes corrections made after the objects were tracked
-        keyframe = self.mapper(frame, features, pose, reference)
+    def _append_pose(
+        self,
+        frame: RGBDFrame,
+        pose: FramePose,
+        motion: CameraMotion,
+        reference: Keyframe | None,
+        keyframe: Keyframe | None,
+    ) -> None:
+        """Append the pose of a frame, and move what is stored in the world frame if the frame defines a new one."""
+        part, predicted_T_cw = self.poses.part, self._compose_pose(motion)  # with corrections since the objects
         T_new_old = self.poses.append(frame.stamp, pose, motion, reference, keyframe)
-        if keyframe is not None:
-            self.back_end.submit(keyframe)
         self._apply_world_correction(T_new_old)
         guessed_T_cw = predicted_T_cw if T_new_old is None else predicted_T_cw @ invert(T_new_old)
         self._move_to_map(pose, guessed_T_cw, is_other_part=self.poses.part != part)
         is_pose_known = self.poses.is_localised or not self.poses.was_found  # until then, the world frame is temporary
         self.up_estimator.add_gravity(frame.gravity if is_pose_known else None, self.poses.T_cw, T_new_old)
-        return keyframe
 
     def _move_to_map(self, pose: FramePose, guessed_T_cw: Tensor, *, is_other_part: bool) -> None:
         """Move the objects of the frame from the pose with which they were tracked to the pose in the map.

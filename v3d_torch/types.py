@@ -26,8 +26,8 @@ from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.geometry.se3 import interpolate
 
 MIN_INTERVAL = 0.01
-"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Stamps that are closer to
-each other come from a computer that received two frames at once, and the camera has moved for longer."""
+"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Closer stamps
+come from a computer that received two frames at once; the true interval was longer."""
 
 _MAX_STAMP = 1e11
 """Maximum stamp of a frame, seconds, three thousand years: a larger one is in milliseconds or nanoseconds."""
@@ -273,7 +273,7 @@ class LandmarkObserver:
         return self.landmarks[self.landmarks >= 0]
 
     @property
-    def count(self) -> int:
+    def landmark_count(self) -> int:
         """Number of observed landmarks."""
         return len(self.observed_landmarks)
 

@@ -366,7 +366,7 @@ def test_lost_camera_is_relocalised_at_its_pose() -> None:
     place = camera.loop_closer.relocalise(features, camera.map)
     assert place is not None
     assert place.keyframe.index in (0, 1, 2, 3, 4)
-    assert place.tracking.count > 100
+    assert place.tracking.landmark_count > 100
     expected = invert(invert(camera.map.keyframes[2].T_cw) @ displacement)
     offset = se3_log(place.tracking.T_cw @ invert(expected)).abs()
     # As accurate as the map around the keyframe, which drifts by 6 mm per keyframe.

@@ -74,6 +74,6 @@ def test_batch_is_the_same_as_one_by_one() -> None:
     assert torch.equal(torch.vmap(torch.vmap(level_frame))(up), single)
 
 
-def test_gradient() -> None:
+def test_gradient_equals_finite_differences() -> None:
     up = torch.tensor([[0.2, -0.9, 0.3], [0.05, 0.02, -1.0]], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(level_frame, up)

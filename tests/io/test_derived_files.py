@@ -32,7 +32,7 @@ def targets(tmp_path: Path) -> list[Path]:
     return [tmp_path / "one.onnx", tmp_path / "two.onnx"]
 
 
-def test_files_are_written_once(targets: list[Path]) -> None:
+def test_files_that_exist_are_not_written_again(targets: list[Path]) -> None:
     write = Writer()
     for _ in range(2):
         derive(targets, write)

@@ -10,7 +10,7 @@ from v3d_torch.io.timestamps import associate, parse_timestamp
 
 
 @pytest.mark.parametrize("text", ["1305031102.175304", "0", "-3.5", "7", "1e3"])
-def test_seconds_are_unchanged(text: str) -> None:
+def test_seconds_are_parsed_unchanged(text: str) -> None:
     assert parse_timestamp(text) == float(text)
 
 

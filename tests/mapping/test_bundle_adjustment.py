@@ -13,7 +13,7 @@ from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
 from v3d_torch.kernels import compiler
 from v3d_torch.mapping.bundle_problem import prepare_bundle
-from v3d_torch.optim.levenberg_marquardt import huber
+from v3d_torch.optim.robust_losses import huber
 from v3d_torch.optim.schur import solve_normal_equations
 
 

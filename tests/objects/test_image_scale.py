@@ -33,7 +33,7 @@ def test_values_of_a_kinect_are_those_of_the_configuration() -> None:
         ((424, 240), 212.0, 2, (1, 3, 5, 21)),
     ],
 )
-def test_values_are_scaled(
+def test_stride_and_margins_scale_with_the_width_of_the_image(
     size: tuple[int, int], focal_length: float, stride: int, margins: tuple[int, int, int, int]
 ) -> None:
     scaled = scale_to_image(CONFIG, camera_of(*size, focal_length))

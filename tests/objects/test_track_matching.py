@@ -11,11 +11,11 @@ from helpers.boards import CAMERA, CHAIR, CLOUDS, HERE, Board, BoardTracker, ren
 from v3d_torch.config import TrackerConfig
 from v3d_torch.objects.appearance import HISTOGRAM_SIZE
 from v3d_torch.objects.instance_clouds import InstanceBackProjector
-from v3d_torch.objects.track_matching import compare_tracks, compare_without_masks, detect_instances, predict_tracks
+from v3d_torch.objects.track_matching import compare_tracks, compare_without_masks, predict_tracks, to_detections
 
 
-def evidence(before: list[Board], after: list[Board], appearance: torch.Tensor | None = None) -> torch.Tensor:
-    """Return the evidence for each pair of a board before (three frames) and a detected board after."""
+def log_ratio_of(before: list[Board], after: list[Board], appearance: torch.Tensor | None = None) -> torch.Tensor:
+    """Return the log-likelihood ratio of each pair of a board before (three frames) and a detected board after."""
     track_boards = BoardTracker()
     for _ in range(3):
         tracks = track_boards(*before)
@@ -24,14 +24,14 @@ def evidence(before: list[Board], after: list[Board], appearance: torch.Tensor |
             track.appearance = torch.eye(HISTOGRAM_SIZE)[0]
     depth, instances = render(after)
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-    detected = detect_instances(0.1, instances, clouds, appearance, HERE, 1)
+    detected = to_detections(0.1, instances, clouds, appearance, HERE, 1)
     predicted = predict_tracks(tracks, 0.1, depth, HERE, CAMERA, CLOUDS, 1)
     return compare_tracks(predicted, detected, TrackerConfig())
 
 
 def test_board_continues_itself_rather_than_its_neighbour() -> None:
     boards = [Board(-0.3), Board(0.3)]
-    ratio = evidence(boards, boards)
+    ratio = log_ratio_of(boards, boards)
     assert bool((ratio.diag() > 5).all())
     assert ratio[0, 1] == ratio[1, 0] == -torch.inf  # both are visible where they were predicted
 
@@ -39,14 +39,14 @@ def test_board_continues_itself_rather_than_its_neighbour() -> None:
 def test_other_appearance_is_evidence_against_a_pair() -> None:
     same, other = (torch.eye(HISTOGRAM_SIZE)[i : i + 1] for i in (0, 1))
     boards = [Board(0.0)]
-    assert float(evidence(boards, boards, same) - evidence(boards, boards, other)) > 5
+    assert float(log_ratio_of(boards, boards, same) - log_ratio_of(boards, boards, other)) > 5
 
 
 def test_lost_track_beyond_the_gate_is_impossible() -> None:
     (track,) = BoardTracker()(Board(-0.5))
     depth, instances = render([Board(-0.4), Board(0.9)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-    detected = detect_instances(0.1, instances, clouds, None, HERE, 1)
+    detected = to_detections(0.1, instances, clouds, None, HERE, 1)
     near, far = compare_without_masks([track], detected, TrackerConfig())[0].tolist()
     assert near > 0
     assert far == -torch.inf
@@ -58,7 +58,7 @@ def test_track_lost_for_seconds_is_found_again_by_its_colours(colour: int, likel
     track.update_appearance(torch.eye(HISTOGRAM_SIZE)[0])
     depth, instances = render([Board(0.1)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-    detected = detect_instances(4.0, instances, clouds, torch.eye(HISTOGRAM_SIZE)[colour][None], HERE, 1)
+    detected = to_detections(4.0, instances, clouds, torch.eye(HISTOGRAM_SIZE)[colour][None], HERE, 1)
     assert bool(compare_without_masks([track], detected, TrackerConfig()) > 0) is likely
 
 
@@ -71,7 +71,7 @@ def test_colours_of_a_lost_track_are_those_of_all_its_views_not_of_the_last_smal
             (track,) = track_boards.track(*render([board]), frame / 30, appearance=colours)
         depth, instances = render([Board(0.1)])
         clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-        detected = detect_instances(4.0, instances, clouds, colours, HERE, 1)
+        detected = to_detections(4.0, instances, clouds, colours, HERE, 1)
         ratios.append(float(compare_without_masks([track], detected, TrackerConfig())))
     assert ratios[1] > ratios[0] - 0.5
 
@@ -80,10 +80,10 @@ def test_empty_place_is_no_evidence_against_the_return_of_a_lost_track() -> None
     (track,) = BoardTracker()(Board(0.0))
     depth, instances = render([Board(0.1)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-    detected = detect_instances(1.0, instances, clouds, None, HERE, 1)
+    detected = to_detections(1.0, instances, clouds, None, HERE, 1)
     before = compare_without_masks([track], detected, TrackerConfig())
     track.add_vacated_time(0.3, 0.3)
-    assert track.vacated_evidence < 0
+    assert track.vacated_log_ratio < 0
     assert torch.equal(compare_without_masks([track], detected, TrackerConfig()), before)
 
 
@@ -96,7 +96,7 @@ def test_evidence_of_an_empty_place_starts_anew_with_each_detection() -> None:
             track.add_vacated_time(0.02, 0.02)
         track_boards(Board(0.0))
         track.add_vacated_time(0.04, 0.01)
-        found.append((track.vacated_time, track.vacated_evidence))
+        found.append((track.vacated_time, track.vacated_log_ratio))
     assert found[0] == found[1] and found[0][1] < 0
 
 
@@ -114,7 +114,7 @@ def test_lost_walker_is_expected_where_a_person_slows_down() -> None:
     for x in (expected, constant):
         depth, instances = render([Board(x)])
         clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-        detected = detect_instances(stamp, instances, clouds, None, HERE, 1)
+        detected = to_detections(stamp, instances, clouds, None, HERE, 1)
         ratios.append(float(compare_without_masks([track], detected, TrackerConfig())))
     assert ratios[0] > ratios[1]
 
@@ -126,9 +126,9 @@ def test_empty_predicted_mask_is_no_evidence_against_an_instance() -> None:
         tracks = track_boards(Board(0.0))
     depth, instances = render([Board(0.0)])
     clouds = InstanceBackProjector(CLOUDS, CAMERA)(depth, instances)
-    detected = detect_instances(0.1, instances, clouds, None, HERE, 1)
+    detected = to_detections(0.1, instances, clouds, None, HERE, 1)
     predicted = predict_tracks(tracks, 0.1, depth, HERE, CAMERA, CLOUDS, 1)
-    empty = replace(predicted, masks=torch.zeros_like(predicted.masks))
+    empty = replace(predicted, coarse_masks=torch.zeros_like(predicted.coarse_masks))
     hidden = replace(empty, visible_fractions=torch.zeros_like(predicted.visible_fractions))
     assert predicted.visible.all()
     ratios = [compare_tracks(each, detected, TrackerConfig()) for each in (empty, hidden)]

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from v3d_torch.optim.levenberg_marquardt import huber, levenberg_marquardt, student_t, student_t_scale
+from v3d_torch.optim.levenberg_marquardt import levenberg_marquardt
+from v3d_torch.optim.robust_losses import huber, student_t, student_t_scale
 
 
 def test_huber_is_continuous_and_its_weight_is_the_derivative() -> None:

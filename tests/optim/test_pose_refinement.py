@@ -20,9 +20,9 @@ from torch import Tensor
 
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import invert, se3_exp, se3_log
-from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.pose_refinement import PoseRefinement, refine_pose, refine_pose_unchecked
 from v3d_torch.optim.reprojection import Measurements, reprojection_jacobian, reprojection_residuals
+from v3d_torch.optim.robust_losses import huber
 
 
 def refine(T_cw: Tensor, points: Tensor, measured: Measurements) -> PoseRefinement:

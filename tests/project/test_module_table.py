@@ -28,7 +28,7 @@ def rows() -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("name", CASES_BY_FUNCTION)
-def test_cells_are_as_measured(name: str) -> None:
+def test_page_states_what_each_function_was_measured_to_support(name: str) -> None:
     assert rows()[name] == [measure(name, column) for column in COLUMNS]
 
 

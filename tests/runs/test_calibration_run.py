@@ -17,13 +17,8 @@ from v3d_torch.config import Config
 from v3d_torch.datasets.cameras import load_camera
 from v3d_torch.io.files import write_text
 from v3d_torch.runs import calibration_run
-from v3d_torch.runs.calibration_run import (
-    UNITS,
-    _is_converged,
-    calibrate_sequence,
-    calibration_table,
-    calibration_text,
-)
+from v3d_torch.runs.calibration_report import UNITS, calibration_table, calibration_text
+from v3d_torch.runs.calibration_run import _is_converged, calibrate_sequence
 
 
 def calibrated(*estimates: Estimate) -> Calibration:

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.se3 import invert, se3_exp
-from v3d_torch.segmentation.segmenter import segmenter_state_of
-from v3d_torch.segmentation.upright import UprightSegmenter, up_votes
+from v3d_torch.segmentation.upright import UprightSegmenter
 from v3d_torch.types import Instances
 
 
@@ -151,9 +150,7 @@ def test_gravity_in_any_orientation_of_the_camera_gives_the_up_direction_of_the_
     T_cw, up = se3_exp(twist), torch.nn.functional.normalize(up[:3], dim=0)
     upright = UprightSegmenter(Network())
     upright.segment_with_pose(replace(make_frame(0, 0), gravity=-T_cw[:3, :3] @ up), T_cw)
-    votes = up_votes(upright.state_dict())
-    assert votes is not None
-    torch.testing.assert_close(votes / votes.norm(), up)
+    torch.testing.assert_close(upright.up_votes / upright.up_votes.norm(), up)
 
 
 @pytest.mark.parametrize("turns", range(4))
@@ -162,7 +159,7 @@ def test_searches_of_a_rolled_camera_vote_for_the_up_direction_of_the_world(turn
     for index in range(8):  # three searches, each with a vote of weight 1 for the upright turn
         upright.segment_with_pose(make_frame(index, turns), rolled(-90.0 * turns))
     expected = torch.tensor([0.0, -3.5, 0.0], dtype=torch.float64)  # with the prior
-    torch.testing.assert_close(up_votes(upright.state_dict()), expected)
+    torch.testing.assert_close(upright.up_votes, expected)
 
 
 def test_frames_with_gravity_are_never_searched() -> None:
@@ -201,9 +198,10 @@ def test_state_is_a_snapshot() -> None:
     assert upright.state_dict()["up"].norm() > 0
 
 
-def test_votes_are_read_from_the_state_of_upright_segmenters_only() -> None:
+def test_votes_of_a_call_do_not_change_those_of_the_call_before() -> None:
     upright = UprightSegmenter(Network())
+    before = upright.up_votes
+    expected = before.clone()
     upright.segment_with_pose(make_frame(0, 1), IDENTITY)
-    votes = up_votes(segmenter_state_of(upright))
-    assert votes is not None and votes.norm() > 0.5 and votes[0].abs() > votes[1].abs()
-    assert up_votes(None) is None and up_votes({"up": 3}) is None and up_votes({}) is None
+    votes = upright.up_votes
+    assert torch.equal(before, expected) and votes.norm() > 0.5 and votes[0].abs() > votes[1].abs()

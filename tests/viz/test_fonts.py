@@ -16,7 +16,7 @@ from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.types import Trajectory
 from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.fonts import _characters, _families, draw_title, drawable_text
-from v3d_torch.viz.objects_figure import draw_objects
+from v3d_torch.viz.objects_figure import draw_objects_from_above
 from v3d_torch.viz.occupancy_figure import draw_occupancy
 from v3d_torch.viz.trajectory_figure import draw_trajectory
 
@@ -28,7 +28,7 @@ VOXELS = torch.tensor([[0, 0, 0], [1, 0, 0]])  # one occupied, one free
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 FIGURES: dict[str, Callable[[str], Figure]] = {
     "trajectory": lambda title: draw_trajectory(None, POSES, title),
-    "objects": lambda title: draw_objects(ObjectTable(), POSES, torch.zeros(1, 3), UP, title),
+    "objects": lambda title: draw_objects_from_above(ObjectTable(), POSES, torch.zeros(1, 3), UP, title),
     "occupancy": lambda title: draw_occupancy(map_of(VOXELS[:1], VOXELS[1:]), POSES, UP, None, title),
 }
 

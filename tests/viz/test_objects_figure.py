@@ -15,7 +15,7 @@ from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedOb
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.pipeline.run_record import ObjectTable
 from v3d_torch.types import RGBDFrame, Trajectory
-from v3d_torch.viz.objects_figure import box_outline, draw_objects
+from v3d_torch.viz.objects_figure import box_outline, draw_objects_from_above
 
 UP = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
 MASK = torch.zeros(2, 2, dtype=torch.bool)
@@ -53,7 +53,7 @@ def table_of(
 
 def draw_axes(table: ObjectTable) -> Axes:
     trajectory = Trajectory(torch.arange(2.0), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
-    (axes,) = draw_objects(table, trajectory, torch.rand(5, 3), UP, "room $1").axes
+    (axes,) = draw_objects_from_above(table, trajectory, torch.rand(5, 3), UP, "room $1").axes
     return axes
 
 
@@ -108,7 +108,7 @@ def test_path_has_gap_where_the_object_was_not_seen() -> None:
 def test_camera_path_has_gap_where_there_are_no_frames() -> None:
     stamps = torch.tensor([0.0, 1, 2, 100, 101], dtype=torch.float64)
     trajectory = Trajectory(stamps, torch.eye(4, dtype=torch.float64).repeat(5, 1, 1))
-    (axes,) = draw_objects(table_of((1, MotionState.STATIC)), trajectory, torch.rand(5, 3), UP).axes
+    (axes,) = draw_objects_from_above(table_of((1, MotionState.STATIC)), trajectory, torch.rand(5, 3), UP).axes
     assert torch.tensor(axes.lines[0].get_xdata()).isnan().nonzero()[:, 0].tolist() == [3]
 
 

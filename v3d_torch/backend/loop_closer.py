@@ -160,7 +160,7 @@ class LoopCloser(StatefulComponent):
             local = sparse_map.local_map(keyframe.observed_landmarks, self._local_keyframes)
             propagated = propagate_landmarks(motion.inlier_matches, keyframe.landmarks, len(features))
             tracking = self._track_map(features, motion.T_ba @ keyframe.T_cw, local, propagated)
-            if tracking is not None and tracking.count >= self._config.min_inliers:
+            if tracking is not None and tracking.landmark_count >= self._config.min_inliers:
                 yield PlaceMatch(keyframe, tracking)
 
     def _detect_revisit(self, keyframe: Keyframe, sparse_map: SparseMap) -> PlaceMatch | None:
@@ -170,7 +170,7 @@ class LoopCloser(StatefulComponent):
         covisible = count_shared_landmarks(sparse_map, keyframe.observed_landmarks).nonzero()[:, 0].tolist()
         recent = range(keyframe.index - self._config.min_keyframe_gap, keyframe.index + 1)
         for place in self._verified_places(keyframe.features, sparse_map, {*covisible, *recent}):
-            if place.tracking.count >= self._config.min_inlier_ratio * len(place.tracking.visible):
+            if place.tracking.landmark_count >= self._config.min_inlier_ratio * len(place.tracking.visible):
                 return place
         return None
 

@@ -24,7 +24,8 @@ from v3d_torch.kernels import pose_graph as kernels
 from v3d_torch.kernels.compiler import can_read, compiled_by
 from v3d_torch.optim.block_system import solve_block_system
 from v3d_torch.optim.implicit import jacobian
-from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, huber, levenberg_marquardt
+from v3d_torch.optim.levenberg_marquardt import DAMPING_SCHEDULE, REGULARISATION, levenberg_marquardt
+from v3d_torch.optim.robust_losses import huber
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
     check_shapes,

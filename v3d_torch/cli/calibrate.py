@@ -55,7 +55,8 @@ def main(
         from v3d_torch.datasets import SourceOptions, load_sequence
         from v3d_torch.errors import ConfigError, OutputError
         from v3d_torch.io.files import check_writable, write_text
-        from v3d_torch.runs.calibration_run import calibrate_sequence, calibration_table, calibration_text
+        from v3d_torch.runs.calibration_report import calibration_table, calibration_text
+        from v3d_torch.runs.calibration_run import calibrate_sequence
         from v3d_torch.runs.interrupts import interrupts_between_frames
         from v3d_torch.runs.kernel_compilation import compile_with_progress
         from v3d_torch.runs.open_sequences import check_groundtruth, print_notes

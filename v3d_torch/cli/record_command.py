@@ -19,7 +19,6 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.runs.kernel_compilation import compile_with_progress
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
 from v3d_torch.runs.system import check_map_is_given, make_system
-from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation import make_segmenter
 from v3d_torch.types import RGBDFrame
 
@@ -82,8 +81,6 @@ def record_static(
         OutputError: If the folder is not empty, or the poses cannot be written.
     """
     check_map_is_given(config)
-    set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
     slam = make_system(source.camera, make_segmenter(config, source.camera), config)
     pipeline = Pipeline(source, slam, evaluate_masks=False)
     compile_with_progress(console)

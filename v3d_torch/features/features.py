@@ -125,7 +125,7 @@ def make_measurements(
     octave: Tensor,
     sigma_ratio: Tensor,
     config: TrackingConfig,
-    pyramid: FeaturesConfig,
+    features_config: FeaturesConfig,
 ) -> Measurements:
     """Measurements and their noise; that of pixels is proportional to the pixel size of their octave.
 
@@ -135,25 +135,25 @@ def make_measurements(
         octave: Octave of each feature, int64, shape :math:`(N,)`.
         sigma_ratio: See `Features`, float64, shape :math:`(N, 2)`.
         config: Configuration with the standard deviations of pixels at octave 0 and of inverse depth.
-        pyramid: Scale factor between pyramid levels.
+        features_config: Scale factor between pyramid levels.
     """
     pixel_ratio, depth_ratio = sigma_ratio.unbind(dim=1)
     return Measurements(
         uv=uv,
         inverse_depth=inverse_depth,
-        pixel_sigma=config.pixel_sigma * pyramid.scale ** octave.to(torch.float64) * pixel_ratio,
+        pixel_sigma=config.pixel_sigma * features_config.scale ** octave.to(torch.float64) * pixel_ratio,
         inverse_depth_sigma=config.inverse_depth_sigma * depth_ratio,
     )
 
 
-def to_measurements(features: Features, config: TrackingConfig, pyramid: FeaturesConfig) -> Measurements:
+def to_measurements(features: Features, config: TrackingConfig, features_config: FeaturesConfig) -> Measurements:
     """Convert features to measurements with their noise.
 
     Args:
         features: Features of one frame.
         config: Configuration with the standard deviations of pixels and inverse depth.
-        pyramid: Scale factor between pyramid levels.
+        features_config: Scale factor between pyramid levels.
     """
     return make_measurements(
-        features.uv, features.inverse_depth, features.octave, features.sigma_ratio, config, pyramid
+        features.uv, features.inverse_depth, features.octave, features.sigma_ratio, config, features_config
     )

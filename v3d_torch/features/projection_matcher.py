@@ -78,14 +78,14 @@ class ProjectionMatcher:
 
     Args:
         config: Thresholds of descriptor matching.
-        pyramid: Scale pyramid of the features.
+        features_config: Scale pyramid of the features.
         camera: Intrinsics.
     """
 
-    def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
+    def __init__(self, config: TrackingConfig, features_config: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._scale = pyramid.scale
-        self._octaves = octaves_of_levels(pyramid, camera.width)
+        self._scale = features_config.scale
+        self._octaves = octaves_of_levels(features_config, camera.width)
         self._camera = camera
         # Bounds of (z, u, v, cosine, octave) of a landmark in view; the lower bounds are inclusive.
         margin = _OCTAVE_MARGIN

@@ -17,7 +17,6 @@ from v3d_torch.geometry.gradients import without_second_derivatives, zero_with_g
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels.compiler import can_read
 from v3d_torch.optim.implicit import jacobian
-from v3d_torch.optim.levenberg_marquardt import huber
 from v3d_torch.optim.reprojection import (
     chi_square,
     perspective,
@@ -25,6 +24,7 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
+from v3d_torch.optim.robust_losses import huber
 from v3d_torch.optim.schur import NormalEquations, gather_columns, solve_normal_equations, sum_columns
 from v3d_torch.runtime.batches import (
     check_camera_matrix,

@@ -47,7 +47,12 @@ def landmark_points(T_wc: Tensor, features: Features, camera: PinholeCamera) -> 
 
 
 def create_landmarks(
-    table: TensorTable, keyframe: int, T_cw: Tensor, features: Features, camera: PinholeCamera, pyramid: FeaturesConfig
+    table: TensorTable,
+    keyframe: int,
+    T_cw: Tensor,
+    features: Features,
+    camera: PinholeCamera,
+    features_config: FeaturesConfig,
 ) -> Tensor:
     """Append one landmark for each feature to the table of landmarks.
 
@@ -57,7 +62,7 @@ def create_landmarks(
         T_cw: World-to-camera pose of the keyframe, float64, shape :math:`(4, 4)`.
         features: Features with depth.
         camera: Intrinsics.
-        pyramid: Scale pyramid of the features.
+        features_config: Scale pyramid of the features.
 
     Returns:
         Ids of the new landmarks, int64, shape :math:`(N,)`.
@@ -70,7 +75,7 @@ def create_landmarks(
     return table.append(
         point=points,
         direction=ray / distance[:, None],
-        reference_distance=distance * pyramid.scale ** features.octave.to(torch.float64),
+        reference_distance=distance * features_config.scale ** features.octave.to(torch.float64),
         descriptor=features.descriptors,
         keyframe=keyframe * ones,
         found=ones,

@@ -98,7 +98,7 @@ class MapTables(StatefulComponent):
         """Id of a part without keyframes, see `Keyframe`; not 0, which is the part where the map starts."""
         return max((keyframe.part for keyframe in self.keyframes), default=0) + 1
 
-    def keyframe_at(self, stamp: float) -> Keyframe | None:
+    def newest_keyframe_at(self, stamp: float) -> Keyframe | None:
         """Return the newest keyframe if it was created from the frame at a time; None otherwise.
 
         Times identify frames: they increase, whereas the indices of a camera begin again when it is started again.

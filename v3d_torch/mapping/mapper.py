@@ -69,15 +69,15 @@ class Mapper(StatefulComponent):
         config = self._config.mapping
         if not config.enabled:
             return False
-        self._most_tracked = max(self._most_tracked, pose.count)
+        self._most_tracked = max(self._most_tracked, pose.landmark_count)
         if pose.status is not TrackingStatus.TRACKED:
             return self._needs_untracked_keyframe(frame.stamp, features, pose.status)
         self._untracked_since = None
         interval = self._frames_since_keyframe
         if interval >= config.max_keyframe_interval:
             return True
-        view_changed = pose.count < config.min_tracked_ratio * self._most_tracked
-        weak = view_changed or (pose.count < config.min_tracked and interval >= _MIN_KEYFRAME_INTERVAL)
+        view_changed = pose.landmark_count < config.min_tracked_ratio * self._most_tracked
+        weak = view_changed or (pose.landmark_count < config.min_tracked and interval >= _MIN_KEYFRAME_INTERVAL)
         new_landmarks = (pose.landmarks < 0) & (features.depth > 0)
         return weak and int(new_landmarks.sum()) >= self._config.tracking.min_inliers
 

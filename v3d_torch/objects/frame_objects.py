@@ -81,7 +81,7 @@ class FrameObjects:
     Attributes:
         objects: Objects, sorted by id.
         static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
-        map_mask: Pixels of ``static_mask`` at a larger distance from moving objects and from people, even
+        map_mask: Pixels of ``static_mask`` at a larger distance from excluded objects and from people, even
             static ones: for what is stored, such as point map, recordings and static surfaces; bool, shape
             :math:`(H, W)`.
         vote_pairs: Votes that counted over any time span: id of the voting object and id of the object voted for,

@@ -22,8 +22,8 @@ from v3d_torch.objects.track_matching import (
     PredictedTracks,
     compare_tracks,
     compare_without_masks,
-    detect_instances,
     predict_tracks,
+    to_detections,
 )
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE, Instances
@@ -140,7 +140,7 @@ class InstanceTracker(torch.nn.Module):
         """
         camera, stride = self._camera, self._stride
         compared = appearance if self._config.compare_appearance else None
-        detected = detect_instances(stamp, instances, clouds, compared, T_wc, stride)
+        detected = to_detections(stamp, instances, clouds, compared, T_wc, stride)
         matches = self._continued_tracks(instances)
         others = [track for track in self.tracks if track not in matches.values()]
         predicted = predict_tracks(others, stamp, depth, invert(T_wc), camera, self._clouds, stride)
@@ -152,7 +152,7 @@ class InstanceTracker(torch.nn.Module):
             track = matches.get(i)
             if track is None and self._is_duplicate(i, matches, detected):
                 continue
-            masks = instances.masks[i], clouds.cloud_pixels[i], detected.masks[i]
+            masks = instances.masks[i], clouds.cloud_pixels[i], detected.coarse_masks[i]
             track = matches[i] = track or self._start_track(stamp, masks)
             track.add_detection(detection)
             track.set_masks(*masks, missed=False, is_shown=True)
@@ -229,7 +229,7 @@ class InstanceTracker(torch.nn.Module):
         labels = set(detected.labels.tolist())  # an instance continues a track without a mask only if it has its class
         without_masks = [track for track in (*self.resting, *self.lost) if track.label in labels]
         tracks = [*predicted.tracks, *without_masks]
-        evidence = torch.cat(
+        log_ratio = torch.cat(
             [
                 compare_tracks(predicted, detected, self._config),
                 compare_without_masks(without_masks, detected, self._config),
@@ -243,7 +243,7 @@ class InstanceTracker(torch.nn.Module):
         matches: dict[int, Track] = {}
 
         def assign(rows: Tensor, columns: Tensor) -> None:
-            for i, j in _assign(evidence, rows & free_tracks, columns & free_instances):
+            for i, j in _assign(log_ratio, rows & free_tracks, columns & free_instances):
                 matches[j] = tracks[i]
                 free_tracks[i], free_instances[j] = False, False
 
@@ -265,9 +265,9 @@ class InstanceTracker(torch.nn.Module):
 
     def _is_duplicate(self, i: int, matches: dict[int, Track], detected: DetectedInstances) -> bool:
         """Check whether an instance shows the object of a matched instance of the same class, or a part of it."""
-        centroid, mask = detected.detections[i].centroid, detected.masks[i : i + 1]
-        common = count_common_pixels(mask, detected.masks)[0]
-        smaller = torch.minimum(count_pixels(mask), count_pixels(detected.masks))
+        centroid, mask = detected.detections[i].centroid, detected.coarse_masks[i : i + 1]
+        common = count_common_pixels(mask, detected.coarse_masks)[0]
+        smaller = torch.minimum(count_pixels(mask), count_pixels(detected.coarse_masks))
         contained = common > _DUPLICATE_COVERAGE * smaller
         return any(
             bool(contained[j])
@@ -289,7 +289,7 @@ class InstanceTracker(torch.nn.Module):
         missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
         unmatched = {i: track for i, track in enumerate(predicted.tracks) if track not in updated}
-        coarse_masks = predicted.masks[list(unmatched)] & pack_masks(has_depth, self._stride)
+        coarse_masks = predicted.coarse_masks[list(unmatched)] & pack_masks(has_depth, self._stride)
         covered = self._covered(list(unmatched.values()), coarse_masks, updated)
         for (i, track), is_covered in zip(unmatched.items(), covered, strict=True):
             if not track.may_move:
@@ -305,7 +305,7 @@ class InstanceTracker(torch.nn.Module):
             mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)
             is_recent = stamp - track.newest.stamp <= _MAX_SHOWN_TIME + STAMP_TOLERANCE
             is_shown = bool(predicted.visible[i]) and track.is_confirmed and is_recent
-            track.set_masks(mask, mask & has_depth, predicted.masks[i], missed=True, is_shown=is_shown)
+            track.set_masks(mask, mask & has_depth, predicted.coarse_masks[i], missed=True, is_shown=is_shown)
             missed.append(track)
         self._update_tracks_without_masks(stamp, resting, lost)
         return missed
@@ -344,9 +344,9 @@ class InstanceTracker(torch.nn.Module):
         return covered
 
 
-def _assign(evidence: Tensor, rows: Tensor, columns: Tensor) -> list[tuple[int, int]]:
-    """Assign columns to rows by their evidence; return the pairs of indices."""
+def _assign(log_ratio: Tensor, rows: Tensor, columns: Tensor) -> list[tuple[int, int]]:
+    """Assign columns to rows by their log-likelihood ratios; return the pairs of indices."""
     if not (rows.any() and columns.any()):
         return []
-    matched = match_instances(evidence[None], rows[None], columns[None])[0]
+    matched = match_instances(log_ratio[None], rows[None], columns[None])[0]
     return [(i, j) for j, i in enumerate(matched.tolist()) if i >= 0]

@@ -124,7 +124,7 @@ class MotionClassifier(StatefulComponent):
             )
             for track, mask in zip(tracks, in_result, strict=True)
         ]
-        return FrameObjects(objects, masks.static, masks.for_map, evidence.vote.vote_pairs)
+        return FrameObjects(objects, masks.static_mask, masks.map_mask, evidence.vote.vote_pairs)
 
     def move_to_map(self, T_new_old: Tensor, *, all_tracks: bool = False) -> None:
         """Transform what was detected in a guessed world frame into that of the map, see `InstanceTracker.move_to_map`.
@@ -231,7 +231,7 @@ class MotionClassifier(StatefulComponent):
     def _refine_masks(
         self, excluded: Sequence[Track], tracks: Sequence[Track], view: DepthView, appeared_pixels: AppearedPixels
     ) -> dict[Track, RefinedMask]:
-        """Return the refined masks of the excluded objects and of all people; most excluded objects are people."""
+        """Return the refined masks of the excluded objects and of all people."""
         people = [track for track in tracks if track.label == PERSON]
         refinable = list(dict.fromkeys([*excluded, *people]))
         refiner = MaskRefiner(refinable, view, appeared_pixels, self._static_surfaces, self._config, self._camera)

@@ -1,4 +1,4 @@
-"""Static mask: pixels of a frame that tracking can use, and the subset that shows no person."""
+"""Static mask: pixels of a frame that tracking can use, and those of them that maps can use."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class StaticMasks(NamedTuple):
     """Static pixels of a frame.
 
     Attributes:
-        static: Pixels outside of all excluded objects, bool, shape :math:`(H, W)`.
-        for_map: Pixels of ``static`` at a larger distance from all excluded objects and people, bool, shape
+        static_mask: Pixels outside of all excluded objects, bool, shape :math:`(H, W)`.
+        map_mask: Pixels of ``static_mask`` at a larger distance from all excluded objects and people, bool, shape
             :math:`(H, W)`.
     """
 
-    static: Tensor
-    for_map: Tensor
+    static_mask: Tensor
+    map_mask: Tensor
 
 
 def static_masks(
@@ -38,8 +38,8 @@ def static_masks(
         size: Height and width of the image.
         config: Margins of the masks.
     """
-    static = _outside(excluded, size, config.dilation)
-    return StaticMasks(static, static & _outside(all_masks, size, config.map_dilation))
+    static_mask = _outside(excluded, size, config.dilation)
+    return StaticMasks(static_mask, static_mask & _outside(all_masks, size, config.map_dilation))
 
 
 def _outside(masks: Sequence[RefinedMask], size: torch.Size, dilation: int) -> Tensor:

@@ -73,17 +73,17 @@ class StaticSurfaces(StoredViews):
         static.numpy()[rows, columns] = found
         return static
 
-    def add_view(self, view: DepthView, T_dw: Tensor, static: Tensor) -> None:
+    def add_view(self, view: DepthView, T_dw: Tensor, map_mask: Tensor) -> None:
         """Store the static part of a view if the last one is old enough, and drop views that are too old.
 
         Args:
             view: View, newer than all stored ones.
             T_dw: World-to-camera pose at the time of the depth image, float64, shape :math:`(4, 4)`.
-            static: Pixels of the static scene without people, bool, shape :math:`(H, W)`.
+            map_mask: Map mask of the frame, see `FrameObjects`, bool, shape :math:`(H, W)`.
         """
         is_early = bool(self._views) and view.stamp < self._views[-1].stamp + _INTERVAL - STAMP_TOLERANCE
         if is_early or not self._config.enabled:
             return
         # Remove the depth of people first: otherwise the minimum around a pixel beside a person is that of the person.
-        nearest_depth = replace(view, depth=view.depth * static).nearest_depth
+        nearest_depth = replace(view, depth=view.depth * map_mask).nearest_depth
         self._store(StoredView(view.stamp, nearest_depth, T_dw), _TIME_SPAN)

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.se3 import transform_points
-from v3d_torch.objects.association import vacated_log_ratio
 from v3d_torch.objects.feature_shift import FeatureShift, sum_shifts
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.log_ratios import vacated_log_ratio
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import LIVING, RIGID, UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE
@@ -110,7 +110,7 @@ class Track:
         appearance: Mean colour histogram, float32, shape :math:`(D,)`; None if unknown.
         appearance_points: Mean number of points of the views in this histogram, with the same weights.
         vacated_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
-        vacated_evidence: Evidence of the empty place, see `vacated_log_ratio`.
+        vacated_log_ratio: Log-likelihood ratio of the empty place, see `log_ratios.vacated_log_ratio`.
         dynamic_frames: Number of frames in which free space, votes or features showed a motion of the object.
         last_dynamic: Timestamp of the last of these frames, seconds.
         last_deforming: Timestamp of the last frame in which the object deformed, see `chamfer_evidence`, seconds.
@@ -136,7 +136,7 @@ class Track:
     appearance: Tensor | None = None
     appearance_points: float = 0.0
     vacated_time: float = 0.0
-    vacated_evidence: float = 0.0
+    vacated_log_ratio: float = 0.0
     dynamic_frames: int = 0
     last_dynamic: float = -torch.inf
     last_deforming: float = -torch.inf
@@ -272,7 +272,7 @@ class Track:
             self.first_stamp = detection.stamp
         self._max_points = max(self._max_points, len(detection.cloud))
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
-        self.vacated_time = self.vacated_evidence = 0.0
+        self.vacated_time = self.vacated_log_ratio = 0.0
         self.detections.append(detection)
         while self.detections[0].stamp < oldest and len(self.detections) > 2:
             self.detections.pop(0)
@@ -300,8 +300,8 @@ class Track:
             seconds: Time for which it was observed.
         """
         self.vacated_time += seconds
-        evidence = vacated_log_ratio(self.vacated_time, self._filter.state.motion_variance(stamp - self.newest.stamp))
-        self.vacated_evidence = min(self.vacated_evidence, evidence)
+        log_ratio = vacated_log_ratio(self.vacated_time, self._filter.state.motion_variance(stamp - self.newest.stamp))
+        self.vacated_log_ratio = min(self.vacated_log_ratio, log_ratio)
 
     def drop_masks(self) -> None:
         """Drop the masks: the object is not detected, and not predicted either."""

@@ -1,4 +1,4 @@
-"""Evidence for all pairs of tracks and instances of a frame, from positions, masks, appearance and class."""
+"""Log-likelihood ratios of all pairs of tracks and instances of a frame: positions, masks, appearance and class."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from v3d_torch.config import CloudConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
 from v3d_torch.objects.appearance import histogram_similarity
-from v3d_torch.objects.association import (
+from v3d_torch.objects.instance_clouds import InstanceClouds
+from v3d_torch.objects.log_ratios import (
     appearance_log_ratio,
     class_log_ratio,
     overlap_log_ratio,
     position_log_ratio,
 )
-from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.mask_propagation import predict_mask
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.resampling import subsample
@@ -45,14 +45,14 @@ class DetectedInstances:
         stamp: Timestamp, seconds.
         labels: Class of each of N instances, int64, shape :math:`(N,)`.
         detections: Detections of the instances.
-        masks: Coarse masks, packed, uint8, shape :math:`(N, B)`.
+        coarse_masks: Every n-th pixel of the masks, packed, uint8, shape :math:`(N, B)`.
         appearance: Colour histograms, float32, shape :math:`(N, D)`, NaN if unknown; None if they are not compared.
     """
 
     stamp: float
     labels: Tensor
     detections: Sequence[Detection3D]
-    masks: Tensor
+    coarse_masks: Tensor
     appearance: Tensor | None
 
     def __len__(self) -> int:
@@ -66,14 +66,14 @@ class PredictedTracks:
     Attributes:
         tracks: T tracks.
         silhouettes: Projection of the newest cloud of each track at its predicted position.
-        masks: Coarse predicted masks, packed, uint8, shape :math:`(T, B)`.
+        coarse_masks: Every n-th pixel of the predicted masks, packed, uint8, shape :math:`(T, B)`.
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
             :math:`(T,)`.
     """
 
     tracks: Sequence[Track]
     silhouettes: Sequence[Silhouette]
-    masks: Tensor
+    coarse_masks: Tensor
     visible_fractions: Tensor
 
     @property
@@ -82,7 +82,7 @@ class PredictedTracks:
         return self.visible_fractions > _MIN_VISIBLE_FRACTION
 
 
-def detect_instances(
+def to_detections(
     stamp: float,
     instances: Instances,
     clouds: InstanceClouds,
@@ -148,7 +148,7 @@ def predict_tracks(
 
 
 def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    """Add up the evidence for each pair of a track and an instance.
+    """Add up the log-likelihood ratios of each pair of a track and an instance.
 
     An instance can continue a track of its class if it lies within the gate or covers the predicted mask. It can
     continue a track of any class if it overlaps the last or the predicted mask, because the position jumps when an
@@ -166,12 +166,12 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
         return torch.zeros(0, len(detected), dtype=torch.float64)
     # The last mask is accurate if little moves; the predicted mask follows fast walkers and a turning camera.
     last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
-    intersection = count_common_pixels(predicted.masks, detected.masks)
-    areas, predicted_areas = count_pixels(detected.masks), count_pixels(predicted.masks)[:, None]
+    intersection = count_common_pixels(predicted.coarse_masks, detected.coarse_masks)
+    areas, predicted_areas = count_pixels(detected.coarse_masks), count_pixels(predicted.coarse_masks)[:, None]
     coverage = (intersection / torch.minimum(predicted_areas, areas).clamp(min=1)).to(torch.float64)
     overlap = torch.maximum(
         _intersection_over_union(
-            count_common_pixels(last_masks, detected.masks), count_pixels(last_masks)[:, None], areas
+            count_common_pixels(last_masks, detected.coarse_masks), count_pixels(last_masks)[:, None], areas
         ),
         _intersection_over_union(intersection, predicted_areas, areas),
     )
@@ -182,20 +182,20 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     near = _within_gate(squared_distance, predicted.tracks, detected, config) & ~beside
     possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
     visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
-    evidence = (
-        _position_evidence(squared_distance, predicted.tracks, states, detected, possible)
+    log_ratio = (
+        _position_log_ratio(squared_distance, predicted.tracks, states, detected, possible)
         + overlap_log_ratio(coverage, overlap, visible)
-        + _appearance_evidence(predicted.tracks, detected, [len(track.newest.cloud) for track in predicted.tracks])
+        + _appearance_log_ratio(predicted.tracks, detected, [len(track.newest.cloud) for track in predicted.tracks])
         + class_log_ratio(same_class)
-        + torch.tensor([[track.vacated_evidence] for track in predicted.tracks], dtype=torch.float64)
+        + torch.tensor([[track.vacated_log_ratio] for track in predicted.tracks], dtype=torch.float64)
     )
-    return evidence.masked_fill(~possible, -torch.inf)
+    return log_ratio.masked_fill(~possible, -torch.inf)
 
 
 def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    """Add up the evidence for each pair of a track without a predicted mask and an instance.
+    """Add up the log-likelihood ratios of each pair of a track without a predicted mask and an instance.
 
-    The size of a track's view, for the evidence of appearance, is the mean over its views: the last view of an object
+    The size of a track's view, for the log ratio of appearances, is the mean over its views: the last view of an object
     that left the image is small.
 
     Args:
@@ -212,12 +212,12 @@ def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, 
     states = [track.predict_unobserved_state(detected.stamp) for track in tracks]
     squared_distance = _squared_distances(states, detected)
     possible = same_class & _within_gate(squared_distance, tracks, detected, config)
-    evidence = (
-        _position_evidence(squared_distance, tracks, states, detected, possible)
-        + _appearance_evidence(tracks, detected, [track.appearance_points for track in tracks])
+    log_ratio = (
+        _position_log_ratio(squared_distance, tracks, states, detected, possible)
+        + _appearance_log_ratio(tracks, detected, [track.appearance_points for track in tracks])
         + class_log_ratio(same_class)
     )
-    return evidence.masked_fill(~possible, -torch.inf)
+    return log_ratio.masked_fill(~possible, -torch.inf)
 
 
 def _squared_distances(states: Sequence[ObjectState], detected: DetectedInstances) -> Tensor:
@@ -227,14 +227,14 @@ def _squared_distances(states: Sequence[ObjectState], detected: DetectedInstance
     return (observed - predicted[:, None]).square().sum(dim=2)
 
 
-def _position_evidence(
+def _position_log_ratio(
     squared_distance: Tensor,
     tracks: Sequence[Track],
     states: Sequence[ObjectState],
     detected: DetectedInstances,
     possible: Tensor,
 ) -> Tensor:
-    """Evidence of the positions of possible pairs with the predicted states, 0 for other pairs, shape (T, N)."""
+    """Log ratio of the positions of possible pairs with the predicted states, 0 for other pairs, shape (T, N)."""
     variance = torch.ones_like(squared_distance)
     variances = variance.numpy()  # NumPy is faster than torch for single elements
     for i, j in possible.nonzero().tolist():
@@ -242,10 +242,10 @@ def _position_evidence(
     return position_log_ratio(squared_distance.masked_fill(~possible, torch.nan), variance)
 
 
-def _appearance_evidence(
+def _appearance_log_ratio(
     tracks: Sequence[Track], detected: DetectedInstances, tracked_points: Sequence[float]
 ) -> Tensor:
-    """Evidence of appearance, shape (T, N), with the points of the views of the tracks; 0 if it is not compared."""
+    """Log ratio of appearances, shape (T, N), with the points of the tracks' views; 0 if they are not compared."""
     if detected.appearance is None:
         return torch.zeros(len(tracks), len(detected), dtype=torch.float64)
     unknown = torch.full_like(detected.appearance[0], torch.nan)

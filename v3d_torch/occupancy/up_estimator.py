@@ -16,7 +16,7 @@ class UpEstimator(StatefulComponent):
     Attributes:
         gravity: First measured direction of gravity, a unit vector in the world frame, float64, shape :math:`(3,)`;
             None before.
-        votes: Sum of the votes of the segmentation, see `up_votes`; None if there are none.
+        votes: Sum of the votes of the segmentation, see `UprightSegmenter.up_votes`; None if there are none.
     """
 
     _STATE = ("gravity", "votes")

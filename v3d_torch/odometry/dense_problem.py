@@ -12,7 +12,8 @@ from v3d_torch.config import DenseOdometryConfig
 from v3d_torch.geometry.long_products import sum_products
 from v3d_torch.geometry.se3 import se3_exp, transform_points
 from v3d_torch.odometry.dense_view import Level
-from v3d_torch.optim.levenberg_marquardt import REGULARISATION, student_t, student_t_scale
+from v3d_torch.optim.levenberg_marquardt import REGULARISATION
+from v3d_torch.optim.robust_losses import student_t, student_t_scale
 
 State = tuple[Tensor, Tensor]  # T_ba (4, 4); gain and bias from the reference's brightness to the current one's (2,)
 System = tuple[Tensor, Tensor]  # J^T W J (8, 8) and J^T W r (8,) for xi in T_ba @ exp(xi), gain, bias

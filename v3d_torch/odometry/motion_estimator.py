@@ -1,4 +1,4 @@
-"""Frame-to-frame registration: matching, epipolar RANSAC, PnP-RANSAC with depth (paper, Sec. III-E)."""
+"""Registration of two images by features: matching, epipolar RANSAC, PnP-RANSAC with depth (paper, Sec. III-E)."""
 
 from __future__ import annotations
 
@@ -109,15 +109,17 @@ class MotionEstimator:
 
     Args:
         config: Thresholds of matching and RANSAC.
-        features: Grid over which the features are spread, and scale pyramid.
+        features_config: Grid over which the features are spread, and scale pyramid.
         camera: Intrinsics.
         seed: Seed of both RANSACs.
     """
 
-    def __init__(self, config: OdometryConfig, features: FeaturesConfig, camera: PinholeCamera, seed: int) -> None:
+    def __init__(
+        self, config: OdometryConfig, features_config: FeaturesConfig, camera: PinholeCamera, seed: int
+    ) -> None:
         self._config = config
-        self._cell = features.cell
-        self._finest_pixel = features.scale ** octaves_of_levels(features, camera.width)[0]
+        self._cell = features_config.cell
+        self._finest_pixel = features_config.scale ** octaves_of_levels(features_config, camera.width)[0]
         self._camera = camera
         self._seed = seed
 

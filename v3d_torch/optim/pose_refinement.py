@@ -26,7 +26,6 @@ from v3d_torch.optim.levenberg_marquardt import (
     DAMPING_SCHEDULE,
     POSE_TOLERANCE,
     REGULARISATION,
-    huber,
     levenberg_marquardt,
     select,
 )
@@ -41,6 +40,7 @@ from v3d_torch.optim.reprojection import (
     prepare_measurements,
     whiten,
 )
+from v3d_torch.optim.robust_losses import huber
 from v3d_torch.runtime.batches import (
     check_camera_matrix,
     check_shapes,

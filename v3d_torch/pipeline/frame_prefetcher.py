@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import ParamSpec, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 import torch
 
@@ -21,11 +21,15 @@ from v3d_torch.types import RGBDFrame
 PendingFrame = Callable[[], PreprocessedFrame | None]
 """Function that waits for a preprocessed frame; returns None after the last frame."""
 
-ReadFrame = tuple[RGBDFrame, dict[str, StageTime]] | None
-"""A frame and the time that reading it took; None after the last frame."""
-
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
+
+
+class _ReadFrame(NamedTuple):
+    """A frame and the time that reading it took, by stage."""
+
+    frame: RGBDFrame
+    times: dict[str, StageTime]
 
 
 class FramePrefetcher:
@@ -93,32 +97,29 @@ class FramePrefetcher:
         read = self._read()
         if read is None:
             return None
-        frame, times = read
-        return replace(self._slam.preprocess(frame, prediction), read_times=times)
+        return replace(self._slam.preprocess(read.frame, prediction), read_times=read.times)
 
-    def _read(self) -> ReadFrame:
+    def _read(self) -> _ReadFrame | None:
         timer = StageTimer()
         with timer("read"):
             frame = next(self._frames, None)
         if frame is None:
             return None
         self._slam.check(frame)
-        return frame, timer.times
+        return _ReadFrame(frame, timer.times)
 
-    def _segment(self, read: Future[ReadFrame], prediction: PosePrediction | None) -> Segmentation | None:
-        frame = read.result()
-        return None if frame is None else self._slam.segment_instances(frame[0], prediction)
+    def _segment(self, read: Future[_ReadFrame | None], prediction: PosePrediction | None) -> Segmentation | None:
+        return None if (each := read.result()) is None else self._slam.segment_instances(each.frame, prediction)
 
-    def _extract(self, read: Future[ReadFrame]) -> Extraction | None:
-        frame = read.result()
-        return None if frame is None else self._slam.extract_features(frame[0])
+    def _extract(self, read: Future[_ReadFrame | None]) -> Extraction | None:
+        return None if (each := read.result()) is None else self._slam.extract_features(each.frame)
 
 
 def _combine(
-    read: Future[ReadFrame], segmentation: Future[Segmentation | None], extraction: Future[Extraction | None]
+    read: Future[_ReadFrame | None], segmentation: Future[Segmentation | None], extraction: Future[Extraction | None]
 ) -> PreprocessedFrame | None:
     """Wait for the parts of a frame; None after the last frame."""
-    frame, segmented, extracted = read.result(), segmentation.result(), extraction.result()
-    if frame is None or segmented is None or extracted is None:
+    each, segmented, extracted = read.result(), segmentation.result(), extraction.result()
+    if each is None or segmented is None or extracted is None:
         return None
-    return PreprocessedFrame(frame[0], extracted, lambda: segmented, frame[1])
+    return PreprocessedFrame(each.frame, extracted, lambda: segmented, each.times)

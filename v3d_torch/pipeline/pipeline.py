@@ -248,13 +248,12 @@ class Pipeline:
         self.record.objects.append_objects(frame, result, self.slam.up)
         with self._stopwatch.paused():  # the frame rate is that of the system, without the evaluation
             self._evaluate_masks(frame, result)
-        for folder, static in zip(self._mask_folders, (result.static_mask, result.map_mask), strict=True):
+        for folder, mask in zip(self._mask_folders, (result.static_mask, result.map_mask), strict=True):
             if folder is not None:
-                write_png(folder / f"{format_timestamp(frame.stamp)}.png", (~static).to(torch.uint8).numpy() * 255)
-        keyframe = self.slam.map.keyframe_at(frame.stamp)
+                write_png(folder / f"{format_timestamp(frame.stamp)}.png", (~mask).to(torch.uint8).numpy() * 255)
+        keyframe = self.slam.map.newest_keyframe_at(frame.stamp)
         if keyframe is not None:
-            static = result.map_mask
-            self.views.add(keyframe, frame.image, frame.depth, static, frame.depth_delay, result.T_dc)
+            self.views.add(keyframe, frame.image, frame.depth, result.map_mask, frame.depth_delay, result.T_dc)
             if not self.record.was_checked:
                 self.record.people_sizes += apparent_sizes(result.objects, frame.depth, self.slam.camera)
             is_due = self._live is None and not self.record.was_checked

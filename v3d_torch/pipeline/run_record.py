@@ -150,7 +150,7 @@ class ObjectTable(TensorTable):
         return self["frame"][self["motion_state"] != _MOTION_STATES.index(MotionState.STATIC)].unique()
 
     def count_motion_states(self) -> dict[MotionState, int]:
-        """Return the number of rows, frames times objects, with each motion state, in the order of their first row."""
+        """Count the rows, one per frame and object, of each motion state, in the order of their first row."""
         return {_MOTION_STATES[code]: count for code, count in Counter(self["motion_state"].tolist()).items()}
 
 

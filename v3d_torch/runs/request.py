@@ -79,7 +79,7 @@ class RunRequest:
         fps: float | None = None,
         skip_broken: bool = False,
     ) -> RunRequest:
-        """Make the request for a sequence that runs with several configurations; its own is the default."""
+        """Make the request for a sequence of several configurations; ``config`` is replaced in each run."""
         root = None if data_root is None else str(data_root)
         return RunRequest(seq, Config(), data_root=root, camera=camera, fps=fps, skip_broken=skip_broken)
 

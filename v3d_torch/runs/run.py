@@ -8,8 +8,6 @@ from collections.abc import Sized
 from contextlib import suppress
 from pathlib import Path
 
-import torch
-
 from v3d_torch.config import RollingShutterConfig
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets import RGBDStream
@@ -30,7 +28,6 @@ from v3d_torch.runs.map_file import check_map_path, is_map_file
 from v3d_torch.runs.request import RunRequest, write_request
 from v3d_torch.runs.result_folder import remove_unfinished
 from v3d_torch.runs.system import make_system
-from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.segmentation.coco import class_name
 from v3d_torch.types import RGBDFrame, Segmenter
 
@@ -77,8 +74,6 @@ class Run:
         config = request.config
         write_text(folder / RunFile.CONFIG, dump_config(config))  # fails before the first frame if the disk is full
         write_request(folder, request)
-        set_num_threads(config.threads)
-        torch.manual_seed(config.seed)
         slam = make_system(sequence.camera, segment, config, None if known_map is None else known_map.map)
         self._folder = folder
         self._request = request

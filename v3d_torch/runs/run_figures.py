@@ -17,7 +17,7 @@ from v3d_torch.types import Instances, Trajectory
 from v3d_torch.viz.clusters import Cluster, save_clusters_figure
 from v3d_torch.viz.figure_output import save_figure
 from v3d_torch.viz.object_overlay import Overlay, save_mask_figure
-from v3d_torch.viz.objects_figure import draw_objects
+from v3d_torch.viz.objects_figure import draw_objects_from_above
 from v3d_torch.viz.occupancy_figure import draw_occupancy
 from v3d_torch.viz.trajectory_figure import save_trajectory_figure
 from v3d_torch.viz.voting import save_voting_figure
@@ -45,7 +45,7 @@ def draw_run(folder: Path, pipeline: Pipeline, trajectory: Trajectory, point_map
         overlays = [[_overlay(obj) for obj in snapshot.result.objects] for snapshot in record.snapshots]
         save_mask_figure(images, overlays, folder / RunFile.MASKS_FIGURE)
     if len(record.objects):
-        figure = draw_objects(record.objects, trajectory, point_map.points, pipeline.slam.up, sequence.name)
+        figure = draw_objects_from_above(record.objects, trajectory, point_map.points, pipeline.slam.up, sequence.name)
         save_figure(figure, folder / RunFile.OBJECTS_FIGURE)
     mapper = pipeline.slam.occupancy
     if mapper is not None and not mapper.map.is_empty:
@@ -74,7 +74,10 @@ def _draw_votes(path: Path, pipeline: Pipeline, snapshot: Snapshot, title: str) 
 
 
 def _clusters(pipeline: Pipeline, snapshot: Snapshot) -> list[Cluster]:
-    """Compute the clouds of a frame's objects again, with the points removed by outlier rejection."""
+    """Compute clouds from the refined masks of the results, with the points that outlier rejection removes.
+
+    The votes used clouds of the masks of the network.
+    """
     detected = [obj for obj in snapshot.result.objects if not obj.missed]
     if not detected:
         return []

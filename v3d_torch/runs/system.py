@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import torch
+
 from v3d_torch.config import Config
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.mapping.sparse_map import SparseMap
 from v3d_torch.runs.numerics_check import CheckedSLAM
+from v3d_torch.runtime.process import set_num_threads
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import Segmenter
 
@@ -15,6 +18,8 @@ def make_system(
     camera: PinholeCamera, segment: Segmenter, config: Config, known_map: SparseMap | None = None
 ) -> V3DSLAM:
     """Make the system that all commands run: `CheckedSLAM` if ``check_numerics`` is set, else `V3DSLAM`.
+
+    The number of threads and the seed of torch are set as the configuration states them.
 
     Args:
         camera: Camera of all frames.
@@ -25,6 +30,8 @@ def make_system(
     Raises:
         ConfigError: As `V3DSLAM`.
     """
+    set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
     return (CheckedSLAM if config.check_numerics else V3DSLAM)(camera, segment, config, known_map)
 
 

@@ -1,1 +1,1 @@
-"""Threads, memory, imports, timing, padded batches, and checks of arguments."""
+"""Threads, memory, timing, padded batches, state, hooks and import of stages, and checks of frames."""

@@ -61,8 +61,15 @@ class UprightSegmenter:
     def __init__(self, segment: Segmenter) -> None:
         self.wrapped = segment
         self._calls = 0
-        # Sum of the votes, in the world frame; replaced by each vote, never changed in place.
         self._up = torch.tensor([0.0, -_PRIOR_WEIGHT, 0.0], dtype=torch.float64)
+
+    @property
+    def up_votes(self) -> Tensor:
+        """Sum of the votes for the up direction, in detections of score 1, world frame, float64, shape :math:`(3,)`.
+
+        A vote replaces the tensor, and never changes it.
+        """
+        return self._up
 
     def __call__(self, frame: RGBDFrame) -> Instances:
         """Segment a frame without a pose: upright if its gravity was measured, else in its own orientation."""
@@ -141,19 +148,6 @@ def _turns(up: Tensor) -> int:
     """Number of counterclockwise quarter turns that bring an image upright, for an up direction (3,), camera frame."""
     x, y, _ = up.tolist()
     return round(math.atan2(x, -y) / (math.pi / 2)) % 4
-
-
-def up_votes(state: Mapping[str, Any] | None) -> Tensor | None:
-    """Sum of the votes for the up direction in the state of a segmenter.
-
-    Args:
-        state: State of a segmenter; None if it has none.
-
-    Returns:
-        Sum of the votes, in detections of score 1, world frame, float64, shape :math:`(3,)`; None if the segmenter is
-        not an `UprightSegmenter`.
-    """
-    return state["up"] if state is not None and state.keys() == {"calls", "up"} else None
 
 
 def _up_in_camera(turns: int) -> Tensor:

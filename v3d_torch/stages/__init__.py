@@ -1,1 +1,1 @@
-"""Stages of the system: their protocols, and the checks of stages of your own."""
+"""Preprocessing of a frame; protocols, replacement and checks of stages."""

@@ -117,7 +117,8 @@ class FramePreprocessor(ReplaceableStages):
                 instances = segment_frame(self.segment, frame, T_cw)
                 check_instances(instances, frame, LABELS)
                 instances = without_empty_masks(instances)
-        return Segmentation(instances, segmenter_state_of(self.segment), timer.times)
+        up_votes = self.segment.up_votes if isinstance(self.segment, UprightSegmenter) else None
+        return Segmentation(instances, segmenter_state_of(self.segment), timer.times, up_votes)
 
     @torch.no_grad()
     def extract_features(self, frame: RGBDFrame) -> Extraction:

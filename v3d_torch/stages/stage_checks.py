@@ -85,7 +85,7 @@ RESULTS: Mapping[str, tuple[type | TensorSpec, Callable[..., dict[str, int]]] | 
     "compensate": (Features, lambda features, depth, *_: {"N": len(features), **_image_size(depth)}),
     "odometry": (CameraMotion, lambda previous, current, *_: _feature_counts(previous, current)),
     "free_space_check": (AppearedPixels, lambda *_: {}),
-    "propose_unlabelled": (Instances, lambda occupied, instances, depth: _image_size(depth)),
+    "propose_unlabelled": (Instances, lambda appeared_pixels, instances, depth: _image_size(depth)),
     "back_project_instances": (InstanceClouds, lambda depth, instances: {"N": len(instances), **_image_size(depth)}),
     "describe_appearance": (TensorSpec(torch.float32, ("N", "D"), HISTOGRAMS), lambda image, masks: {"N": len(masks)}),
     "classify_motion": (FrameObjects, lambda instances, clouds, view, *_: _image_size(view.depth)),

@@ -47,15 +47,15 @@ class MapTracker:
 
     Args:
         config: Matching thresholds and noise.
-        pyramid: Scale pyramid of the features.
+        features_config: Scale pyramid of the features.
         camera: Camera of all frames.
     """
 
-    def __init__(self, config: TrackingConfig, pyramid: FeaturesConfig, camera: PinholeCamera) -> None:
+    def __init__(self, config: TrackingConfig, features_config: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._pyramid = pyramid
+        self._features_config = features_config
         self._camera = camera
-        self._match = ProjectionMatcher(config, pyramid, camera)
+        self._match = ProjectionMatcher(config, features_config, camera)
 
     def __call__(
         self, features: Features, T_cw: Tensor, local_map: LocalMap, landmarks: Tensor, depth: Tensor | None = None
@@ -112,7 +112,7 @@ class MapTracker:
         config = self._config
         if len(features) < config.min_inliers:
             return None
-        measured = to_measurements(features, config, self._pyramid)
+        measured = to_measurements(features, config, self._features_config)
         refined = refine_pose_unchecked(T_cw, points, measured, self._camera.K, rounds=rounds)
         return refined if int(refined.inliers.sum()) >= config.min_inliers else None
 

@@ -125,7 +125,7 @@ class PoseHistory(StatefulComponent):
             T_new_old = correction if first else None
         if new is None:
             T_ck = _relative(pose.T_cw, reference)
-            if pose.count:
+            if pose.landmark_count:
                 self.observed_landmarks, self._place = pose.observed_landmarks, reference
         else:
             T_ck = torch.eye(4, dtype=torch.float64)

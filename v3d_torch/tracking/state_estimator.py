@@ -59,7 +59,7 @@ class StateEstimator(StatefulComponent):
         "_covariance",
         "_known_covariance",
         "_last_measured",
-        "_last_found",
+        "_last_in_map",
         "_part_covariance_w",
     )
 
@@ -71,7 +71,7 @@ class StateEstimator(StatefulComponent):
         self._owners = torch.zeros(0, dtype=torch.int64)  # keyframes that created its landmarks
         self._covariance = _UNKNOWN  # of the last pose
         self._known_covariance = _UNKNOWN  # the same without the growth since the last measured motion
-        self._last_measured = self._last_found = -torch.inf
+        self._last_measured = self._last_in_map = -torch.inf
         self._part_covariance_w = torch.zeros(6, 6, dtype=torch.float64)  # of the newest disconnected part
 
     def __call__(
@@ -101,11 +101,11 @@ class StateEstimator(StatefulComponent):
         else:
             self._pose_noise.interrupt()
             self._covariance = _transform(self._covariance, motion.T_cp) + self._frame_noise
-            if status is TrackingStatus.LOST and self._last_found > -torch.inf:
-                lost_before, lost = self._filter.stamp - self._last_found, stamp - self._last_found
+            if status is TrackingStatus.LOST and self._last_in_map > -torch.inf:
+                lost_before, lost = self._filter.stamp - self._last_in_map, stamp - self._last_in_map
                 self._covariance = self._covariance + (lost**2 - lost_before**2) * _LOST_FOR_A_SECOND
         if is_in_map:
-            self._last_found = stamp
+            self._last_in_map = stamp
         if is_in_map or motion.is_measured:
             self._filter_measured(stamp, T_wc, motion, is_continuous=not pose.is_relocalised)
             self._known_covariance, self._last_measured = self._covariance, stamp

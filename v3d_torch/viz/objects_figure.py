@@ -43,7 +43,9 @@ _STATES = tuple(MotionState)
 _MOVING = torch.tensor([_STATES.index(state) for state in (MotionState.DYNAMIC, MotionState.DEFORMING)])
 
 
-def draw_objects(objects: ObjectTable, trajectory: Trajectory, points: Tensor, up: Tensor, title: str = "") -> Figure:
+def draw_objects_from_above(
+    objects: ObjectTable, trajectory: Trajectory, points: Tensor, up: Tensor, title: str = ""
+) -> Figure:
     """Draw the objects of a run from above, in the level frame.
 
     A line is the path of an object, in the colour of its motion state in each frame. Its last box is outlined, with its

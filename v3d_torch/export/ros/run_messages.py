@@ -100,7 +100,7 @@ class RunMessages:
         yield from self._pose_messages(stamp, slam)
         yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
         self._has_markers = True
-        if slam.map.keyframe_at(stamp) is not None:
+        if slam.map.newest_keyframe_at(stamp) is not None:
             yield "/cloud", self._cloud(frame, objects.map_mask)
             own = slam.map.own_keyframes
             T_ml = frames.camera_in_map(invert(stack_poses(own)), self._T_mw)

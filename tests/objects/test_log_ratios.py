@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.stats import gamma, multivariate_t
 
-from v3d_torch.objects.association import (
+from v3d_torch.objects.log_ratios import (
     appearance_log_ratio,
     class_log_ratio,
     overlap_log_ratio,

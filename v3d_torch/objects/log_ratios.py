@@ -1,6 +1,6 @@
-"""Association evidence: likelihood of an instance if it continues a track, relative to that of a new object.
+"""Log-likelihood ratios: likelihood of an instance if it continues a track, relative to that of a new object.
 
-Each kind of evidence is a log-likelihood ratio, as in multiple hypothesis tracking (Blackman, 2004): position, overlap
+Data association adds up the ratios of a pair, as in multiple hypothesis tracking (Blackman, 2004): position, overlap
 of the masks, appearance, class and vacated places. Their sum for a pair is positive if the instance more likely
 continues the track than is a new object.
 """
@@ -47,7 +47,7 @@ _DISSIMILARITY_SHAPE = 2.0
 """Shape parameter of the gamma distributions of the dissimilarity."""
 
 _MIN_APPEARANCE = -3.0
-"""Lower bound of the evidence of appearance: some masks cover a part of another person."""
+"""Lower bound of the log ratio of appearances: some masks cover a part of another person."""
 
 _CLASS_CHANGE = -2.0
 """Evidence of a different class; it is small, because the class of an object can change between frames."""
@@ -116,8 +116,8 @@ def appearance_log_ratio(similarity: Tensor, elapsed: Tensor, fewer: Tensor, mor
         + _DISSIMILARITY_RATE * elapsed.clamp(max=_CHANGING_TIME)
         + _PARTIAL_DISSIMILARITY * (1 - fewer / more.clamp(min=1))
     )
-    evidence = (_OTHER_DISSIMILARITY / mean).log() - (1 - similarity) * (1 / mean - 1 / _OTHER_DISSIMILARITY)
-    return (_DISSIMILARITY_SHAPE * evidence).clamp(min=_MIN_APPEARANCE).nan_to_num(nan=0.0)
+    log_ratio = (_OTHER_DISSIMILARITY / mean).log() - (1 - similarity) * (1 / mean - 1 / _OTHER_DISSIMILARITY)
+    return (_DISSIMILARITY_SHAPE * log_ratio).clamp(min=_MIN_APPEARANCE).nan_to_num(nan=0.0)
 
 
 def class_log_ratio(same_class: Tensor) -> Tensor:
@@ -137,5 +137,5 @@ def vacated_log_ratio(seconds: float, variance: float) -> float:
         variance: Variance of each coordinate of the motion since the last detection, square metres.
     """
     # The place is empty as well if the object has moved by more than its radius. The probability of this, for a normal
-    # distribution in two dimensions, limits the evidence, however long the place has been empty.
+    # distribution in two dimensions, limits the log ratio, however long the place has been empty.
     return -min(_VACATED_RATE * seconds, _MAX_VACATED, _RADIUS**2 / (2 * variance))
