@@ -2,15 +2,16 @@
 
 ``python examples/ros2_node.py`` subscribes to ``camera/color/image_raw``, ``camera/color/camera_info`` and
 ``camera/aligned_depth_to_color/image_raw``; other names are given by ``--ros-args -r OLD:=NEW``. It publishes ``/tf``,
-``/odom``, ``/objects``, ``/cloud``, ``/path`` (see `v3d_torch.export.ros.run_messages`) and, every few seconds,
-``/map``. The camera driver should not publish transforms of its own (``publish_tf:=false``). Parameters: ``config``,
-name or file of a configuration; ``set``, list of values, by default ``occupancy.enabled=true``, which ``/map`` needs.
+``/odom``, ``/objects``, ``/cloud``, ``/path`` and, every few seconds, ``/map``. The driver should publish no transforms
+(``publish_tf:=false``). Parameters: ``config``, a configuration; ``set``, values, default ``occupancy.enabled=true``.
 It has not been tried with an installed ROS: the tests run it with stand-ins for the modules of ROS.
 """
 
 from __future__ import annotations
 
 import gc
+import itertools
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from queue import SimpleQueue
 from threading import Thread
@@ -27,10 +28,11 @@ from sensor_msgs.msg import CameraInfo, Image
 
 import v3d_torch as v3d
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
-from v3d_torch.export.ros.run_messages import Message, RunMessages
+from v3d_torch.datasets.ros.camera_info import camera_from_info
+from v3d_torch.export.ros.run_messages import RunMessages, TopicMessage
 
 COLOUR, DEPTH, INFO = "camera/color/image_raw", "camera/aligned_depth_to_color/image_raw", "camera/color/camera_info"
-GRID_INTERVAL = 90  # tracked frames between two grids: a grid takes a tenth of a second
+GRID_INTERVAL = 200  # tracked frames between two grids: that of a large map takes seconds, in a thread of its own
 QOS = {"/map": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)}  # as nav2 subscribes to it
 
 
@@ -41,13 +43,11 @@ class SlamNode(Node):
         super().__init__("v3d_slam")
         config = self.declare_parameter("config", "realtime").value
         overrides = self.declare_parameter("set", ["occupancy.enabled=true"]).value
-        _, info = wait_for_message(CameraInfo, self, INFO)
-        pinhole = *info.k[[0, 4, 2, 5]], info.width, info.height, tuple(info.d), 1000  # depth in millimetres: REP 118
-        self.camera = v3d.PinholeCamera(*pinhole, distortion_model=info.distortion_model or "plumb_bob")
-        self.slam = v3d.V3DSLAM(self.camera, config=v3d.load_config(config, overrides))
+        camera = camera_from_info(wait_for_message(CameraInfo, self, INFO)[1], INFO)
+        self.slam = v3d.V3DSLAM(camera, config=v3d.load_config(config, overrides))
         self.frames: SimpleQueue[v3d.RGBDFrame | None] = SimpleQueue()
-        self._messages, self._store = RunMessages(self.camera), get_typestore(Stores.ROS2_HUMBLE)
-        self._count, self._topics = 0, {}
+        self._messages, self._store = RunMessages(camera), get_typestore(Stores.ROS2_HUMBLE)
+        self._indices, self._topics, self.worker = itertools.count(), {}, ThreadPoolExecutor(1)
         subscribers = [Subscriber(self, Image, name, qos_profile=qos_profile_sensor_data) for name in (COLOUR, DEPTH)]
         self._images = ApproximateTimeSynchronizer(subscribers, queue_size=5, slop=0.02)
         self._images.registerCallback(self._add_frame)
@@ -61,27 +61,27 @@ class SlamNode(Node):
 
     def publish_result(self, result: v3d.LiveResult) -> None:
         """Publish the messages of a tracked frame, and sometimes the grid."""
-        grid = self._messages.of_grid(self.slam) if len(self.slam.poses) % GRID_INTERVAL == 0 else ()
-        for topic, message in (*self._messages.of_frame(result.frame, result, self.slam), *grid):
-            if not topic.endswith("camera_info"):  # the driver publishes it
-                self._publish(topic, message)
+        self._publish([*self._messages.of_frame(result.frame, result, self.slam)])
+        if len(self.slam.poses) % GRID_INTERVAL == 0:
+            self.worker.submit(lambda: self._publish([*self._messages.of_grid(self.slam)]))
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
         time, depth_time = (each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec for each in (colour, depth))
         stamp = time + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
         try:
             images = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
-            frame = v3d.RGBDFrame.from_arrays(self._count, stamp, *images, self.camera, depth_delay=depth_time - time)
+            arguments = next(self._indices), stamp, *images, self.slam.camera
+            self.frames.put(v3d.RGBDFrame.from_arrays(*arguments, depth_delay=depth_time - time))
         except v3d.InputError as error:
             self.get_logger().warning(f"a frame is skipped: {error}")
-        else:
-            self._count += 1
-            self.frames.put(frame)
 
-    def _publish(self, topic: str, message: Message) -> None:
-        if topic not in self._topics:
-            self._topics[topic] = self.create_publisher(get_message(message.__msgtype__), topic, QOS.get(topic, 10))
-        self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
+    def _publish(self, messages: list[TopicMessage]) -> None:
+        for topic, message in messages:
+            if topic.endswith("camera_info"):  # the driver publishes it
+                continue
+            if topic not in self._topics:
+                self._topics[topic] = self.create_publisher(get_message(message.__msgtype__), topic, QOS.get(topic, 10))
+            self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
 
 
 def main() -> None:
@@ -91,7 +91,7 @@ def main() -> None:
     torch.set_num_threads(1)  # more threads mostly wait for each other
     node = SlamNode()
     Thread(target=node.receive, daemon=True).start()
-    with suppress(KeyboardInterrupt):
+    with suppress(KeyboardInterrupt), node.worker:
         v3d.LiveSLAM(iter(node.frames.get, None), node.slam)(node.publish_result)
 
 

@@ -10,8 +10,8 @@ from v3d_torch.calibration.view_edges import ViewEdges, find_edges
 GREY = torch.full((3, 60, 80), 128, dtype=torch.uint8)
 
 
-def edges_of(depth: Tensor, colour: Tensor = GREY) -> ViewEdges:
-    return find_edges(colour, depth, stride=2)
+def edges_of(depth: Tensor, colour: Tensor = GREY, stride: int = 2) -> ViewEdges:
+    return find_edges(colour, depth, stride)
 
 
 def box_in_front(shadow: int = 0) -> Tensor:
@@ -58,3 +58,9 @@ def test_gap_of_a_shadow_can_be_wider_in_frames_with_more_columns() -> None:
     depth = torch.full((20, 640), 2.0)
     depth[:, 300:318], depth[:, 318:] = 0.0, 1.0  # 36 of 1280 columns, as 18 of 640
     assert set(edges_of(depth, torch.full((3, 20, 640), 128, dtype=torch.uint8)).pixel[:, 0].tolist()) == {317.5}
+
+
+def test_views_of_a_few_pixels_have_gradients() -> None:
+    """A stride of 90 leaves such views of 640x480 pixels."""
+    depth, colour = torch.full((6, 8), 2.0), torch.full((3, 6, 8), 128, dtype=torch.uint8)
+    assert edges_of(depth, colour, stride=90).gradients.isfinite().all()

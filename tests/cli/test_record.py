@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -11,19 +12,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 import pytest
 import torch
 from helpers.bags import DEPTH, INFO, RGB, MessageFactory
 from helpers.commands import assert_error_line, invoke
-from helpers.long_wall import CAMERA, Slide
+from helpers.long_wall import CAMERA, Jump, Slide
 from helpers.tiny_images import CAMERA_YAML, HEIGHT, WIDTH, colour_of, depth_of, save
 from helpers.waiting import wait_until
 from rich.console import Console
 
 from v3d_torch.cli.record import app
-from v3d_torch.cli.record_command import record_all
+from v3d_torch.cli.record_command import record_all, record_static
+from v3d_torch.config.loading import load_config
 from v3d_torch.datasets import RGBDSequence, load_sequence, tum_writer
+from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.io.files import write_png
 from v3d_torch.runtime.hangup import handled_hangup
 from v3d_torch.types import Instances, RGBDFrame
@@ -185,3 +189,15 @@ def test_help_lists_options() -> None:
     assert done.exit_code == 0
     for option in ("seq", "out", "data-root", "camera", "rgb-topic", "depth-topic", "info-topic", "fps"):
         assert f"--{option}" in done.stdout
+
+
+def test_static_recording_has_no_poses_of_frames_whose_place_is_a_guess(tmp_path: Path) -> None:
+    """A reconstruction would put both places into one."""
+    config = load_config(None, ("segmentation.source=none", "mapping.restart_after=0.3"))
+    output = io.StringIO()
+    frames, failure = record_static(Jump(), tmp_path / "out", config, Event(), Console(file=output))
+    assert failure is None
+    estimate = read_trajectory(tmp_path / "out" / "estimated_trajectory.txt")
+    left_out = frames - len(estimate)
+    assert left_out > 10 and len(estimate) >= 26
+    assert f"note: {left_out} frames without a known pose are left out of estimated_trajectory.txt" in output.getvalue()

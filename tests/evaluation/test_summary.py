@@ -278,3 +278,9 @@ def test_notes_and_missing_scores_are_listed() -> None:
     document = format_markdown([noted, unscored])
     assert "## Notes\n\n- room, full, seed 0: aligned by the orientations\n" in document
     assert "## Not scored\n\n- attic, full, seed 0: attic: the depth images are empty\n" in document
+
+
+def test_other_sequences_stay_in_tables_with_absent_ones() -> None:
+    outcomes = [*runs("my_room", "full", 0.1), *runs("fr3/w/xyz", "full", 0.02)]
+    lines = rows(format_markdown(outcomes, ["fr3/w/rpy"]).partition("\n## RPE")[0])
+    assert [line[0] for line in lines[2:]] == ["fr3/w/xyz", "fr3/w/rpy", "my_room"]

@@ -133,8 +133,9 @@ def test_node_skips_unreadable_images_and_ends_when_spinning_fails() -> None:
     assert len(ros.warnings) == 2 and "a frame is skipped: camera/color/image_raw: " in ros.warnings[0]
 
 
-def test_camera_without_distortion_can_leave_its_model_empty() -> None:
-    ros = make_ros(lambda node: islice(images(node), 2), d=[], model="")
+@pytest.mark.parametrize("model", ["", "none", "radtan"])
+def test_camera_without_distortion_can_have_any_model(model: str) -> None:
+    ros = make_ros(lambda node: islice(images(node), 2), d=[], model=model)
     run_node(ros)
     assert len(ros.published["/odom"]) == 2
 

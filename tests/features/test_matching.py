@@ -146,3 +146,11 @@ def test_threshold_that_no_match_can_pass_is_an_error(name: str, value: float, s
     descriptors = torch.zeros(4, size, dtype=torch.uint8)
     with pytest.raises(ConfigError, match=f"^{name} is {value}; give a .*number of at least 0$"):
         match_descriptors(descriptors, descriptors, **{name: value})  # type: ignore[arg-type]
+
+
+def test_ratio_of_infinity_to_equal_descriptors_matches_nothing_in_both_implementations() -> None:
+    """The limit is infinity times 0, which no distance is below."""
+    a = random_descriptors(4, 0)
+    twin = TWINS["v3d_torch.features.matching.match_descriptors"]
+    for match in twin if ENABLED else (twin.torch,):
+        assert match(a, torch.cat([a, a]), max_ratio=float("inf")).tolist() == 4 * [-1]

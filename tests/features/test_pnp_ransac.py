@@ -200,3 +200,16 @@ def test_too_few_points_of_a_mapped_batch_give_no_pose(count: int) -> None:
     found = torch.func.vmap(pnp_ransac)(inputs["points"], inputs["uv"], inputs["K"])
     assert found.found.tolist() == [False, False] and not found.inliers.any()
     torch.testing.assert_close(found.T_cw, torch.eye(4, dtype=torch.float64).expand(2, 4, 4))
+
+
+@pytest.mark.parametrize("iterations", [5, 20])
+def test_few_samples_never_replace_a_prediction_by_a_pose_with_fewer_inliers(iterations: int) -> None:
+    """Random pixels of 60 in 100 points; no sample of so few has three of the others."""
+    generator = torch.Generator().manual_seed(0)
+    corner, size = torch.tensor([-1.0, -1, 2]).double(), torch.tensor([CAMERA.width, CAMERA.height]).double()
+    points = 2 * torch.rand(100, 3, dtype=torch.float64, generator=generator) + corner
+    uv = CAMERA.project(points)
+    uv[:60] = torch.rand(60, 2, dtype=torch.float64, generator=generator) * size
+    prediction = torch.eye(4, dtype=torch.float64)
+    found = pnp_ransac(points, uv, CAMERA.K, prediction, iterations=iterations)
+    assert found.inliers[60:].all() and se3_log(found.T_cw).norm() < 0.01

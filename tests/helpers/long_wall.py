@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import torch
@@ -59,3 +62,15 @@ class Slide:
         if index in self._dark:
             image = torch.zeros_like(image)
         return RGBDFrame(index, float(self.stamps[index]), image, torch.full((1, 240, 320), DISTANCE))
+
+
+class Jump:
+    """Frames at one end of a long wall, then at its other end."""
+
+    name, camera, groundtruth = "jump", CAMERA, None
+
+    def __iter__(self) -> Iterator[RGBDFrame]:
+        frames = [
+            frame for part in (Slide(0, 200), Slide(960, 1120)) for frame in map(part.__getitem__, range(len(part)))
+        ]
+        return (replace(frame, index=index, stamp=index / 10) for index, frame in enumerate(frames))

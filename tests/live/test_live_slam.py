@@ -306,6 +306,39 @@ def test_stored_sequence_is_rejected() -> None:
         LiveSLAM(sequence, V3DSLAM(sequence.camera, NoSegmentation()))
 
 
+def test_stored_stream_without_an_index_is_rejected() -> None:
+    """As a recording of librealsense, which is played as fast as it is read."""
+
+    class Recording:
+        name, camera, groundtruth = "recording", CAMERA, None
+
+        def __iter__(self) -> Iterator[RGBDFrame]:
+            return iter([])
+
+    with pytest.raises(InputError, match=r"^recording: is stored, and most of its frames would be dropped"):
+        LiveSLAM(Recording(), V3DSLAM(CAMERA, square))
+
+
+def test_second_loop_is_rejected_while_the_source_waits_for_a_frame_of_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A generator cannot be asked for a frame in two threads."""
+    monkeypatch.setattr("v3d_torch.live.frame_capture._JOIN_TIMEOUT", 0.05)
+    queue: Queue[RGBDFrame | None] = Queue()
+
+    def frames() -> Iterator[RGBDFrame]:
+        while (frame := queue.get()) is not None:
+            yield frame
+
+    live = LiveSLAM(frames(), V3DSLAM(CAMERA, square))
+    queue.put(Wall()[0])
+    for _ in live:
+        break
+    with pytest.raises(InputError, match="the source still waits for a frame of the loop before; end the source first"):
+        next(iter(live))
+    queue.put(None)
+
+
 @pytest.mark.parametrize("is_same", [True, False])
 def test_second_loop_with_earlier_frames_is_an_input_error(is_same: bool) -> None:
     live = LiveSLAM([Wall()[1]], V3DSLAM(CAMERA, square))

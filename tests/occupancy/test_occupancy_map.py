@@ -399,3 +399,26 @@ def test_points_that_are_not_finite_or_very_far_away_are_unknown(
     assert room.distance(points).isnan().tolist() == [False, True, False]
     assert room.gradient(points).isnan().any(dim=1).tolist() == [False, True, False]
     assert room.states(points)[1] == VoxelState.UNKNOWN and room.probability(points)[1].isnan()
+
+
+def test_distances_after_a_change_need_a_search_near_the_points_only(
+    scattered: tuple[OccupancyMap, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A planner asks for a few places of each new map; the second place is searched in the whole map."""
+    occupancy, mask = scattered
+    sizes: list[int] = []
+
+    class Counting(NearestVoxels):
+        def __init__(self, centres: Tensor, max_distance: float) -> None:
+            sizes.append(len(centres))
+            super().__init__(centres, max_distance)
+
+    monkeypatch.setattr(occupancy_map, "NearestVoxels", Counting)
+    points = (box_of_voxels((-20, -20, -20), (20, 16, 13)).to(torch.float64) + 0.5) * SIZE
+    expected = occupancy.distance(points)
+    other = OccupancyMap(CONFIG.model_copy(update={"max_distance": 2 * SIZE}))
+    other.load_state_dict(occupancy.state_dict())
+    near, far = points[:5], points[-5:]
+    for place, rows in ((near, slice(5)), (near, slice(5)), (far, slice(-5, None)), (points, slice(None))):
+        assert torch.equal(other.distance(place), expected[rows].clamp(max=2 * SIZE))
+    assert sizes[-2] < sizes[-1] == mask.sum() and len(sizes) <= 3

@@ -394,3 +394,15 @@ def test_prediction_that_is_not_finite_does_not_affect_the_others_of_a_batch() -
     found = refine_pose(**inputs)
     torch.testing.assert_close(found.T_cw[::2], expected[::2])
     assert found.T_cw[1, :3].isnan().all() and not found.inliers[1].any()
+
+
+def test_prediction_that_is_not_finite_does_not_change_the_gradients_of_shared_values() -> None:
+    inputs, sigma = camera_inputs.view(3, 30, torch.float64), torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    del inputs["valid"]
+    alone = {name: each[::2] for name, each in inputs.items()}
+    refine_pose(**alone | {"pixel_sigma": sigma}).T_cw.sum().backward()
+    expected, sigma.grad = sigma.grad, None
+    inputs["T_cw"][1] = torch.nan
+    refine_pose(**inputs | {"pixel_sigma": sigma}).T_cw[::2].sum().backward()
+    assert expected is not None and sigma.grad is not None
+    torch.testing.assert_close(sigma.grad, expected)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +15,6 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from helpers import long_wall
-from helpers.long_wall import Slide
 from helpers.moving_camera import keyframe
 from helpers.short_wall import CAMERA, FRAMES, WALL, StoredWall, Wall, make_pipeline, run_along_wall, square
 from torch import Tensor
@@ -331,21 +329,9 @@ def test_camera_is_checked_when_its_own_run_has_enough_keyframes(monkeypatch: py
     assert checked == [6]  # frames 0 and 5 became keyframes
 
 
-class Jump:
-    """Frames at one end of a long wall, then at its other end."""
-
-    name, camera, groundtruth = "jump", long_wall.CAMERA, None
-
-    def __iter__(self) -> Iterator[RGBDFrame]:
-        frames = [
-            frame for part in (Slide(0, 200), Slide(960, 1120)) for frame in map(part.__getitem__, range(len(part)))
-        ]
-        return (replace(frame, index=index, stamp=index / 10) for index, frame in enumerate(frames))
-
-
 def test_part_of_the_map_whose_place_is_a_guess_is_uncertain_and_not_in_the_point_map() -> None:
     config = load_config(None, ("segmentation.source=none", "mapping.restart_after=0.3"))
-    pipeline = Pipeline(Jump(), V3DSLAM(long_wall.CAMERA, config=config))
+    pipeline = Pipeline(long_wall.Jump(), V3DSLAM(long_wall.CAMERA, config=config))
     results: list[FrameResult] = []
     pipeline(lambda frame, result: results.append(result))
     pipeline.flush()

@@ -126,6 +126,14 @@ def test_object_in_observed_free_space_leaves_no_surface() -> None:
 # --- the mesh
 
 
+def test_vertices_that_no_view_observes_have_the_colour_of_their_neighbours() -> None:
+    """The silhouettes of a crate before a wall: triangles are observed at their centres, some vertices are not."""
+    mesh = fuse_mesh(views_of(looking_around(3), CRATE), CONFIG)
+    expected = 255 * ((mesh.vertices.double() - ROOM[0]) / (ROOM[1] - ROOM[0])).clamp(0, 1)
+    dark = (mesh.colours == 0).all(dim=1) & (expected > 20).any(dim=1)
+    assert dark.sum() <= 1 and len(mesh.vertices) > 10_000
+
+
 def test_vertices_lie_on_the_surfaces_of_the_room(room: Mesh) -> None:
     assert len(room.vertices) > 20_000
     error = distance_to(room.vertices.double(), CRATE)

@@ -84,7 +84,7 @@ def find_edges(colour: Tensor, depth: Tensor, stride: int) -> ViewEdges:
     grey = cv2.cvtColor(np.ascontiguousarray(colour.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
     smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR / stride)
     gradients = [np.abs(cv2.Scharr(smooth, cv2.CV_32F, u, v)) / 32 for u, v in ((1, 0), (0, 1))]
-    contrast = cv2.blur(gradients[0] + gradients[1], (_CONTRAST_WINDOW // stride,) * 2) + _MIN_CONTRAST
+    contrast = cv2.blur(gradients[0] + gradients[1], (max(_CONTRAST_WINDOW // stride, 1),) * 2) + _MIN_CONTRAST
     normalised = [np.minimum(gradient / contrast, _MAX_GRADIENT) for gradient in gradients]
     centred = [gradient - gradient.mean() for gradient in normalised]
     return ViewEdges(

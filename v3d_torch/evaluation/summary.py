@@ -214,7 +214,8 @@ def _order_sequences(sequences: Sequence[str], absent: Sequence[str]) -> list[st
     """Return the sequences in the given order; in the paper's order if some of its sequences are absent."""
     if not absent:
         return list(sequences)
-    return [sequence for sequence in load_paper_scores()["ate"] if sequence in {*sequences, *absent}]
+    ordered = [sequence for sequence in load_paper_scores()["ate"] if sequence in {*sequences, *absent}]
+    return [*ordered, *(sequence for sequence in sequences if sequence not in ordered)]
 
 
 def _table(heading: str, results: Sequence[_Result]) -> ErrorTable:

@@ -119,7 +119,7 @@ def pnp_ransac(
         # Only pixels have residuals; the measured depth is already part of the points.
         weights = consensus.to(torch.float64)
         refined = refine_pose(hypothesis, points, uv, K, None, sigma, weights=weights, valid=valid, rounds=2)
-        is_new = exists & ~done & refined.inliers.any(dim=-1)
+        is_new = exists & ~done & (refined.inliers.sum(dim=-1) > inliers.sum(dim=-1))
         T_cw, inliers = select(is_new, (refined.T_cw.to(dtype), refined.inliers), (T_cw, inliers))
         found = found | is_new
         done = done | (is_new & (2 * inliers.sum(dim=-1) > count))

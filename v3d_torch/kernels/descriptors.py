@@ -93,7 +93,7 @@ def match_descriptors(a: Words, b: Words, max_hamming: int, max_ratio: float) ->
             continue
         nearest = _first_of(from_a, best)
         from_a[nearest] = MAX_DISTANCE
-        if best >= max_ratio * _minimum(from_a):
+        if not best < max_ratio * _minimum(from_a):  # also if it is NaN, as in the torch function
             continue
         _measure_distances(b, nearest, (rows[0], rows[1], rows[2], rows[3]), from_b)
         if _minimum(from_b) == best and _first_of(from_b, best) == i:  # the lower row wins ties

@@ -63,6 +63,11 @@ class FrameCapture:
         self._stop = Event()
         self._thread = Thread(target=self._run, name="capture", daemon=True)
 
+    @property
+    def is_waiting(self) -> bool:
+        """True if the thread has not ended, because it waits for the next frame of the source."""
+        return self._thread.is_alive()
+
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()

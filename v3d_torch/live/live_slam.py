@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
-from v3d_torch.datasets.base import RGBDSequence
+from v3d_torch.datasets.base import LiveStream, RGBDStream
 from v3d_torch.errors import ConfigError, InputError
 from v3d_torch.frame_result import FrameResult
 from v3d_torch.io.timestamps import round_timestamp
@@ -78,7 +78,7 @@ class LiveSLAM:
     def __init__(self, source: Iterable[RGBDFrame], slam: V3DSLAM) -> None:
         if not slam.config.prefetch:
             raise ConfigError("prefetch=false: a live camera needs threads; remove --serial or set prefetch=true")
-        if isinstance(source, RGBDSequence):
+        if isinstance(source, RGBDStream) and not isinstance(source, LiveStream):
             raise InputError(
                 f"{source.name}: is stored, and most of its frames would be dropped; wrap it in RealtimePlayback, or"
                 " call slam(frame) for each frame"
@@ -105,12 +105,15 @@ class LiveSLAM:
         The frames that are being captured and preprocessed when the loop is left are discarded, and not counted.
 
         Raises:
-            InputError: If another loop over this object has not ended, the source ends with an error, a frame is not
-                valid, or the first one is not later than the frames that the system has tracked.
+            InputError: If another loop over this object has not ended, or the source still waits for a frame of it. If
+                the source ends with an error, a frame is not valid, or the first one is not later than the frames that
+                the system has tracked.
             ConfigError: If the segmenter did not return valid `Instances`.
         """
         if self._is_running:
             raise InputError("another loop over this LiveSLAM has not ended; leave it first")
+        if self._capture is not None and self._capture.is_waiting:
+            raise InputError("the source still waits for a frame of the loop before; end the source first")
         self._is_running = True
         try:
             yield from self._run()

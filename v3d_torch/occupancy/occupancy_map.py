@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -47,6 +47,22 @@ class VoxelState(IntEnum):
     """Contains a static surface."""
 
 
+class _NearestInBox(NamedTuple):
+    """Search of the nearest occupied voxels for points around which the box contains all voxels within the distance.
+
+    Attributes:
+        blocks: All blocks of the map.
+        low: Smallest coordinates of the box, metres, float64, shape (3,).
+        high: Largest coordinates of the box, metres, float64, shape (3,).
+        search: Search of the voxels in the box.
+    """
+
+    blocks: VoxelBlocks
+    low: Tensor
+    high: Tensor
+    search: NearestVoxels
+
+
 class OccupancyMap:
     """Voxel grid with log-odds of occupancy, in the world frame.
 
@@ -65,7 +81,7 @@ class OccupancyMap:
         self.config = config
         self.blocks = VoxelBlocks()
         self.sensor_model = SensorModel.from_config(config)
-        self._nearest: tuple[VoxelBlocks, NearestVoxels] | None = None  # the occupied voxels of some blocks
+        self._nearest: _NearestInBox | None = None
         self._is_full_window_reported = False
 
     @property
@@ -92,10 +108,7 @@ class OccupancyMap:
         Returns:
             Centres, metres, float64, shape :math:`(N, 3)`, of each chunk; at least one tensor.
         """
-        for chunk in self.blocks.chunks():
-            known, is_occupied = chunk.log_odds != UNKNOWN, chunk.log_odds >= 0
-            voxels = chunk.voxels_where(is_occupied if state == VoxelState.OCCUPIED else known & ~is_occupied)
-            yield (voxels.to(torch.float64) + 0.5) * self.config.voxel_size
+        return _points_by_chunk(self.blocks, state, self.config.voxel_size)
 
     def integrate(self, depth: Tensor, static: Tensor, rays: Tensor, T_wc: Tensor) -> None:
         """Add the observations of a depth image.
@@ -223,12 +236,35 @@ class OccupancyMap:
 
     def _offsets(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Vectors from the nearest occupied voxels to points, (..., 3), and mask of those not truncated, (...)."""
-        rows, blocks, stored = _rows(points), self.blocks, self._nearest
-        if stored is None or stored[0] is not blocks:  # every change of the map makes other blocks
-            stored = blocks, NearestVoxels(self.occupied_points, self.config.max_distance)
-            self._nearest = stored
-        nearest, near = stored[1](rows)
+        rows = _rows(points)
+        nearest, near = self._nearest_around(rows)(rows)
         return points.to(torch.float64) - nearest.reshape(points.shape), near.reshape(points.shape[:-1])
+
+    def _nearest_around(self, points: Tensor) -> NearestVoxels:
+        """Return a search of the nearest voxels of points, float64, (N, 3).
+
+        After a change of the map it has only the blocks around the points, because a planner asks for some places of
+        each new map; if points elsewhere follow, it has the whole map.
+        """
+        blocks, stored, finite = self.blocks, self._nearest, points[points.isfinite().all(dim=1)]
+        if len(finite) == 0:
+            finite = points.new_zeros(1, 3)
+        reach, side = self.config.max_distance, SIDE * self.config.voxel_size
+        low, high = finite.amin(dim=0) - reach, finite.amax(dim=0) + reach
+        is_newest = stored is not None and stored.blocks is blocks  # every change of the map makes other blocks
+        if stored is not None and is_newest and bool((stored.low <= low).all() and (stored.high >= high).all()):
+            return stored.search
+        searched = blocks
+        if is_newest:
+            low, high = torch.full_like(low, -torch.inf), torch.full_like(high, torch.inf)
+        else:
+            corners = blocks.coordinates.to(torch.float64) * side
+            searched = copy.copy(blocks)
+            searched.keep(((corners + side >= low) & (corners <= high)).all(dim=1))
+        occupied = torch.cat(list(_points_by_chunk(searched, VoxelState.OCCUPIED, self.config.voxel_size)))
+        search = NearestVoxels(occupied, reach)
+        self._nearest = _NearestInBox(blocks, low, high, search)
+        return search
 
     def _smallest_extent(self) -> float:
         """Smallest side of the box around the stored blocks, metres; 0 without blocks."""
@@ -269,6 +305,14 @@ class OccupancyMap:
                 count, self.config.window_radius, self.config.max_blocks, self.config.voxel_size,
             )  # fmt: skip
         self._is_full_window_reported = True
+
+
+def _points_by_chunk(blocks: VoxelBlocks, state: VoxelState, voxel_size: float) -> Iterator[Tensor]:
+    """Yield the centres of voxels, see `OccupancyMap.points_by_chunk`."""
+    for chunk in blocks.chunks():
+        known, is_occupied = chunk.log_odds != UNKNOWN, chunk.log_odds >= 0
+        voxels = chunk.voxels_where(is_occupied if state == VoxelState.OCCUPIED else known & ~is_occupied)
+        yield (voxels.to(torch.float64) + 0.5) * voxel_size
 
 
 def _rows(points: Tensor) -> Tensor:

@@ -239,7 +239,8 @@ def refine_pose(
     )
     check_camera_matrix(K)
     finite = points.isfinite().all(dim=-1) & uv.isfinite().all(dim=-1)  # others would make every step NaN
-    valid = finite if valid is None else finite & valid
+    exists = T_cw.detach().isfinite().all(dim=-1).all(dim=-1)  # NaN would reach the gradients of other poses
+    valid = (finite if valid is None else finite & valid) & exists[..., None]
     weights = fill_weights(weights, valid)
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     scale, offset = whiten(measured, K.to(torch.float64))
@@ -252,16 +253,20 @@ def refine_pose(
         valid=valid,
     )
     initial, dtype = T_cw.detach().to(torch.float64), result_dtype(T_cw.dtype)
+    exists = exists[..., None, None]
+    initial = torch.where(exists, initial, torch.eye(4, dtype=torch.float64, device=initial.device))
     if batch:
         initial, problem = initial.expand(*batch, 4, 4), problem.expand(batch)
     minimise = partial(_minimise, initial, rounds=rounds, iterations=iterations, tolerance=tolerance)
     if not needs_gradient(*problem):
-        return _cast(minimise(*problem)[0], dtype)
+        found = minimise(*problem)[0]
+        return _cast(found._replace(T_cw=torch.where(exists, found.T_cw, torch.nan)), dtype)
     found, active = minimise(*problem.detach())
     robust = _is_robust(rounds - 1, rounds)
     at = problem.residuals_at(problem.differentiate(found.T_cw, active, robust=robust))
     information, _ = problem.normal_equations(at, problem.robust_cost(at, active, robust=robust)[1])
-    return _cast(PoseRefinement(at.T_cw, found.inliers, problem.chi2(at), information), dtype)
+    refined = torch.where(exists, at.T_cw, torch.nan)
+    return _cast(PoseRefinement(refined, found.inliers, problem.chi2(at), information), dtype)
 
 
 def refine_pose_unchecked(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
 import torch
@@ -65,7 +66,7 @@ def fuse_mesh(views: StaticViews, config: DenseMapConfig) -> Mesh:
     used, faces = _drop_hidden(vertices, faces, views, config).unique(return_inverse=True)
     vertices = vertices[used]
     normals = _vertex_normals(vertices, faces)
-    colours = _vertex_colours(vertices, normals, views, config)
+    colours = _vertex_colours(vertices, normals, faces, views, config)
     return Mesh(vertices.to(torch.float32), faces, normals.to(torch.float32), colours)
 
 
@@ -130,16 +131,24 @@ def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
     return normalize(sums, dim=1)
 
 
-def _vertex_colours(vertices: Tensor, normals: Tensor, views: StaticViews, config: DenseMapConfig) -> Tensor:
+def _vertex_colours(
+    vertices: Tensor, normals: Tensor, faces: Tensor, views: StaticViews, config: DenseMapConfig
+) -> Tensor:
     """Mean colour of each vertex in the views that observe it from the front, uint8, shape (V, 3).
 
-    Colours are fused per vertex and not per voxel, because there are far fewer vertices.
+    A vertex that none observes, at the border of a triangle whose centre is observed, has the mean colour of its
+    neighbours. Colours are fused per vertex and not per voxel, because there are far fewer vertices.
     """
     sums, weights = vertices.new_zeros(len(vertices), 3), vertices.new_zeros(len(vertices), 1)
     for view in views:
         weight, u, v = _observe(vertices, normals, view, views.camera, config)
         sums += weight[:, None] * view.colour[:, v, u].T
         weights += weight[:, None]
+    is_unseen = weights[:, 0] == 0
+    for start, end in permutations(faces.unbind(dim=1), 2):
+        rows = torch.nonzero(is_unseen[start] & ~is_unseen[end])[:, 0]
+        sums.index_add_(0, start[rows], sums[end[rows]])
+        weights.index_add_(0, start[rows], weights[end[rows]])
     return torch.where(weights > 0, sums / weights, 0.0).round().to(torch.uint8)
 
 

@@ -84,3 +84,16 @@ def test_accelerometer_that_cannot_be_read_is_logged(
         found = measure_accelerations("simulated", SimpleNamespace(query_sensors=lambda: [Busy()]), colour)
     assert found.shape == (0, 3)
     assert f"cannot be read ({reason}); gravity is not used" in caplog.text
+
+
+def test_accelerometer_that_sends_nothing_is_logged(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("v3d_torch.datasets.realsense.accelerometer._TIMEOUT", 0.1)
+    device, _, profile, colour = make_device()
+    identity = rs.extrinsics()
+    identity.rotation, identity.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [0, 0, 0]
+    profile.register_extrinsics_to(colour, identity)
+    with caplog.at_level(logging.WARNING):
+        assert measure_accelerations("simulated", device, colour).shape == (0, 3)
+    assert "simulated: the accelerometer sends no measurements; gravity is not used" in caplog.text

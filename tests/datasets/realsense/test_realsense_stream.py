@@ -40,6 +40,7 @@ from v3d_torch.datasets import RGBDSequence, RGBDStream, SourceOptions, load_seq
 from v3d_torch.datasets.base import LiveStream
 from v3d_torch.datasets.realsense import RealSenseCamera, RealSenseStream
 from v3d_torch.datasets.realsense.device import PipelineDevice, open_live_device
+from v3d_torch.datasets.realsense.realsense_camera import open_realsense_camera
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.live import LiveSLAM
@@ -522,3 +523,29 @@ def test_unsupported_distortion_model_is_rejected_unless_it_is_zero() -> None:
 
 def test_depth_unit_of_the_device_sets_the_depth_scale() -> None:
     assert camera_with(make_intrinsics(COLOUR_K), depth_unit=float(np.float32(0.0001))).depth_scale == 10000
+
+
+def test_other_camera_at_the_start_of_the_stream_is_an_input_error() -> None:
+    """Its images do not fit the calibration, which is that of the first one."""
+    devices = [SimulatedDevice(), SimulatedDevice()]
+    devices[1].serial = "2"
+    stream = RealSenseCamera("simulated", lambda: devices.pop(0))
+    with pytest.raises(InputError, match="simulated: another camera was plugged in, 2; start again to use it"):
+        next(iter(stream))
+
+
+def test_interrupted_camera_is_opened_again_by_its_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With two cameras connected, unplugging the one in use would otherwise open the other."""
+    monkeypatch.setattr("v3d_torch.datasets.realsense.realsense_camera._RETRY_INTERVAL", 0.05)
+    asked, devices = [], [SimulatedDevice(), SimulatedDevice()]
+
+    def open_device(name: str, serial: str, fps: float | None) -> SimulatedDevice:
+        asked.append(serial)
+        return devices[len(asked) > 2]
+
+    monkeypatch.setattr(OPEN_LIVE_DEVICE, open_device)
+    with closing(iter(open_realsense_camera("realsense:"))) as frames:  # type: ignore[type-var]
+        next(frames)
+        devices[0].unplugged.set()
+        next(frames)
+    assert asked == ["", "", devices[0].serial]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from helpers import long_wall
 from helpers.bag_messages import (
     Messages,
     lookup,
@@ -38,7 +39,7 @@ from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.camera_state import CameraState
-from v3d_torch.types import RGBDFrame
+from v3d_torch.types import RGBDFrame, TrackingStatus
 
 CONFIG = load_config(overrides=["mapping.max_keyframe_interval=5"])
 AS_SEEN = map_frame(None)
@@ -364,3 +365,25 @@ def test_frames_before_the_end_of_time_are_recorded_and_the_error_names_the_caus
     assert failure is not None and "ROS messages have times from 0 to 2^31 s" in failure
     assert len(run.pipeline.slam.poses) == FRAMES
     assert len(read_with_mcap(run.path)["/tf"]) == 5
+
+
+def test_transform_from_map_and_objects_are_left_out_while_the_place_is_a_guess(tmp_path: Path) -> None:
+    """A robot would navigate by a pose that can be wrong by metres."""
+    config = load_config(None, ("segmentation.source=none", "mapping.restart_after=0.3"))
+    slam = V3DSLAM(long_wall.CAMERA, config=config)
+    statuses: list[TrackingStatus] = []
+    pipeline = Pipeline(long_wall.Jump(), slam, viewer=BagViewer(tmp_path / "run.mcap", long_wall.CAMERA))
+    pipeline(lambda _, result: statuses.append(result.status))
+    pipeline.flush()
+    pipeline.fuse_points()
+    messages = read_with_mcap(tmp_path / "run.mcap")
+    frames_of = {
+        round(time / 1e8): {(each.header.frame_id, each.child_frame_id) for each in tf.transforms}
+        for time, tf in messages["/tf"]
+    }
+    guessed = [index for index, status in enumerate(statuses) if status is TrackingStatus.DISCONNECTED]
+    assert len(guessed) > 10
+    for index, frames in frames_of.items():
+        assert (("map", "odom") in frames) == (index not in guessed)
+        assert ("odom", "camera_link") in frames
+    assert {round(time / 1e8) for time, _ in messages["/cloud"]}.isdisjoint(guessed)

@@ -39,7 +39,10 @@ def measure_accelerations(source: str, device: Any, colour: Any) -> NDArray[np.f
             if profile.stream_type() == rs.stream.accel:
                 try:
                     rotation = np.reshape(profile.get_extrinsics_to(colour).rotation, (3, 3), order="F")
-                    return _read(rs, sensor, profile) @ rotation.T
+                    measured = _read(rs, sensor, profile) @ rotation.T
+                    if len(measured) == 0:
+                        _LOG.warning("%s: the accelerometer sends no measurements; gravity is not used", source)
+                    return measured
                 except RuntimeError as error:
                     reason = first_line(error)
                     _LOG.warning("%s: the accelerometer cannot be read (%s); gravity is not used", source, reason)

@@ -41,13 +41,22 @@ class RealSenseCamera(RealSenseStream):
         name: Name of the stream, for tables and error messages.
         open_device: Function that opens the camera without starting it.
         camera: Camera chosen by the user; None for the calibration of the device.
+        reopen_device: Function that opens the camera with a serial number, after an interruption; None for
+            ``open_device``. It is needed if several cameras can be connected.
 
     Raises:
         InputError: If ``open_device`` raises it, or the distortion model is not supported.
     """
 
-    def __init__(self, name: str, open_device: Callable[[], Device], camera: CameraChoice = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        open_device: Callable[[], Device],
+        camera: CameraChoice = None,
+        reopen_device: Callable[[str], Device] | None = None,
+    ) -> None:
         super().__init__(name, open_device, camera)
+        self._reopen_device = reopen_device or (lambda _: open_device())
         self._stopped = Event()
         self._captured_at = 0.0
 
@@ -60,6 +69,7 @@ class RealSenseCamera(RealSenseStream):
         """
         self._stopped.clear()
         first = self._open_device()
+        self._check_serial(first)
         gravity = gravity_direction(first.measure_accelerations(), self.name)
         device: Device | None = first
         index, stamp, arrival = 0, 0.0, 0.0
@@ -78,7 +88,7 @@ class RealSenseCamera(RealSenseStream):
                     index += 1
             if index == first_index:  # such as a camera that another program uses: it is there, but cannot be started
                 self._stopped.wait(_RETRY_INTERVAL)
-            device = self._reopen(first.serial)
+            device = self._reopen()
 
     def captured_at(self, frame: RGBDFrame) -> float:
         """Return the time of capture of the newest frame in the clock of the computer, seconds.
@@ -104,18 +114,22 @@ class RealSenseCamera(RealSenseStream):
             _LOG.warning("%s: the camera is interrupted, waiting for it (%s)", self.name, first_line(error))
             return None
 
-    def _reopen(self, serial: str) -> Device | None:
+    def _reopen(self) -> Device | None:
         """Wait for a camera that was unplugged; None if the stream is stopped before."""
         while not self._is_stopped():
             try:
-                device = self._open_device()
+                device = self._reopen_device(self._serial)
             except (InputError, RuntimeError):  # librealsense raises the second one if the camera goes away again
                 self._stopped.wait(_RETRY_INTERVAL)
                 continue
-            if device.serial != serial:
-                raise InputError(f"{self.name}: another camera was plugged in, {device.serial}; start again to use it")
+            self._check_serial(device)
             return device
         return None
+
+    def _check_serial(self, device: Device) -> None:
+        """Raise InputError if a device is not the one that gave the calibration."""
+        if device.serial != self._serial:
+            raise InputError(f"{self.name}: another camera was plugged in, {device.serial}; start again to use it")
 
 
 def _clock_shift(previous: float, expected: float, stamp: float) -> float:
@@ -150,4 +164,8 @@ def open_realsense_camera(name: str, camera: CameraChoice = None, *, fps: float 
     """
     serial = name.partition(":")[2]
     label = f"realsense_{serial}" if serial else "realsense"  # without a colon: valid as a folder name
-    return RealSenseCamera(label, partial(open_live_device, label, serial, fps), camera)
+
+    def open_device(serial: str) -> Device:
+        return open_live_device(label, serial, fps)
+
+    return RealSenseCamera(label, partial(open_device, serial), camera, open_device)

@@ -68,6 +68,7 @@ class RealSenseStream:
         device = open_device()
         self.name = name
         self.camera = _choose_camera(name, device, camera)
+        self._serial = device.serial
         self._open_device = open_device
 
     def __iter__(self) -> Iterator[RGBDFrame]:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.datasets.broken_frames import first_readable
-from v3d_torch.datasets.camera_fields import camera_from_fields
 from v3d_torch.datasets.cameras import CameraChoice, camera_file, choose_camera
 from v3d_torch.datasets.cursor import Cursor
 from v3d_torch.datasets.image_sequence import ImageSequence
@@ -22,6 +21,7 @@ from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
 from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
+from v3d_torch.datasets.ros.camera_info import camera_from_info, fields_of_info
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_scale import MILLIMETRES
@@ -215,8 +215,10 @@ def _index_messages(
     cameras: list[tuple[float, dict[str, Any]]] = []  # the first one, and the first different one
     for done, (topic, arrival, message) in enumerate(_read_messages(path, *read), start=1):
         if topic == info:
-            if len(cameras) < 2 and (fields := _camera_fields(message, topics)) not in [known for _, known in cameras]:
-                cameras.append((arrival * 1e-9, fields))
+            if len(cameras) < 2:
+                fields = fields_of_info(message, is_rectified=topics.is_rectified)
+                if fields not in [known for _, known in cameras]:
+                    cameras.append((arrival * 1e-9, fields))
             continue
         stamp = message.header.stamp
         stamps[topic].append(stamp.sec + stamp.nanosec * 1e-9)
@@ -242,7 +244,7 @@ def _read_camera(path: Path, topics: BagTopics) -> PinholeCamera:
         raise InputError(
             f"{path}: has no messages on {topics.info}; name another topic with --info-topic, or pass --camera"
         )
-    return camera_from_fields(_camera_fields(info, topics), f"{path}: {topics.info}")
+    return camera_from_info(info, f"{path}: {topics.info}", is_rectified=topics.is_rectified)
 
 
 def _note_camera_change(path: Path, topics: BagTopics, arrival: float) -> str:
@@ -251,18 +253,6 @@ def _note_camera_change(path: Path, topics: BagTopics, arrival: float) -> str:
         f"{path}: {topics.info}: the camera changes at {arrival:.6f} s (time of arrival), but all frames use the first"
         " one; cut the bag there, or pass --camera if the change is wrong"
     )
-
-
-def _camera_fields(info: Any, topics: BagTopics) -> dict[str, Any]:
-    """Return the fields of a camera file of a CameraInfo message."""
-    # ROS 1 has field names in upper case, ROS 2 in lower case.
-    K, D, P = (getattr(info, name if hasattr(info, name) else name.lower()) for name in "KDP")
-    rows = (np.asarray(P).reshape(3, 4) if topics.is_rectified else np.asarray(K).reshape(3, 3)).tolist()
-    intrinsics = {"fx": rows[0][0], "fy": rows[1][1], "cx": rows[0][2], "cy": rows[1][2]}
-    distortion, model = ([], "") if topics.is_rectified else (np.asarray(D).tolist(), info.distortion_model)
-    size = {"width": info.width, "height": info.height, "depth_scale": MILLIMETRES}
-    lens = {"distortion": distortion, "distortion_model": model}
-    return intrinsics | size | lens
 
 
 def _image_size(path: Path, topics: BagTopics) -> tuple[int, int]:

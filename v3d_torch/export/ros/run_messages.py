@@ -13,9 +13,11 @@
 ``/map``                          ``nav_msgs/OccupancyGrid``, at the end      the floor, if an occupancy map is grown
 ================================  ==========================================  =====================================
 
-While the camera is lost, only ``/camera/color/camera_info`` has messages; the first lost frame also removes the markers
-of ``/objects``. ``map`` turns against ``odom`` when the floor has shown where up is, at the latest at the end, with one
-more ``/tf``; a measured gravity is known at the first frame.
+While the camera is lost, only ``/camera/color/camera_info`` has messages. While its place in the map is only a guess
+(status ``disconnected``), there are also ``/odom`` and the transforms from ``odom`` on, but none from ``map``, so that
+navigation in the map stops. The first of these frames also removes the markers of ``/objects``. ``map`` turns against
+``odom`` when the floor has shown where up is, at the latest at the end, with one more ``/tf``; a measured gravity is
+known at the first frame.
 """
 
 from __future__ import annotations
@@ -91,13 +93,16 @@ class RunMessages:
         """
         self.stamp = stamp = frame.stamp
         yield "/camera/color/camera_info", camera_info(stamp, frames.OPTICAL, self._camera)
+        is_localised = slam.poses.is_localised
+        if not is_localised and self._has_markers:  # viewers would show them until the camera is found
+            yield "/objects", no_markers(stamp)
+            self._has_markers = False
         if slam.poses.status is TrackingStatus.LOST:
-            if self._has_markers:  # viewers would show them until the camera is found
-                yield "/objects", no_markers(stamp)
-                self._has_markers = False
             return
         self._T_mw = frames.map_frame(slam.T_lw)
         yield from self._pose_messages(stamp, slam)
+        if not is_localised:
+            return
         yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
         self._has_markers = True
         if slam.map.newest_keyframe_at(stamp) is not None:
@@ -123,7 +128,8 @@ class RunMessages:
             newest = self._last[-1] if self._last else len(slam.poses) - 1
             T_ml = frames.camera_in_map(invert(slam.poses.poses_of([newest])[0]), T_mw)
             self._odometry_frame.turn_map(T_ml)
-            yield "/tf", self._tree(self.stamp, is_lost=slam.poses.status is TrackingStatus.LOST)
+            is_lost = slam.poses.status is TrackingStatus.LOST
+            yield "/tf", self._tree(self.stamp, is_localised=True, is_lost=is_lost)
         yield (
             "/path",
             path(self.stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw)),
@@ -133,7 +139,9 @@ class RunMessages:
         yield from self._grid(self.stamp, slam)
 
     def of_grid(self, slam: V3DSLAM) -> Iterator[TopicMessage]:
-        """Yield the occupancy grid, if there is one; finding its floor takes up to a tenth of a second.
+        """Yield the occupancy grid, if there is one: it takes 0.1 s in a room, and seconds in a map of 20 m.
+
+        Another thread can call this while frames are tracked.
 
         Args:
             slam: System after at least one frame.
@@ -151,7 +159,7 @@ class RunMessages:
         T_cw = slam.poses.poses_of([known[0]] * (3 - len(known)) + known)  # the first also stands for those before it
         odometry_frame.update(*frames.camera_in_map(invert(T_cw), self._T_mw))
         self._last = known[-2:]
-        yield "/tf", self._tree(stamp)
+        yield "/tf", self._tree(stamp, is_localised=slam.poses.is_localised)
         to_link = _rotate_both_halves(frames.T_LINK_OPTICAL)
         to_odom = _rotate_both_halves(odometry_frame.T_ol @ frames.T_LINK_OPTICAL)
         yield (
@@ -166,9 +174,9 @@ class RunMessages:
             ),
         )
 
-    def _tree(self, stamp: float, *, is_lost: bool = False) -> Message:
-        """Make the transforms of the newest pose; those of the camera are left out while it is lost."""
-        tree = {(frames.MAP, frames.ODOM): self._odometry_frame.T_mo}
+    def _tree(self, stamp: float, *, is_localised: bool, is_lost: bool = False) -> Message:
+        """Make the transforms of the newest pose: from ``map`` if its place is known, to the camera if its pose is."""
+        tree = {(frames.MAP, frames.ODOM): self._odometry_frame.T_mo} if is_localised else {}
         if not is_lost:
             tree[frames.ODOM, frames.CAMERA] = self._odometry_frame.T_ol
             tree[frames.CAMERA, frames.OPTICAL] = frames.T_LINK_OPTICAL  # every time: a replay can start later
