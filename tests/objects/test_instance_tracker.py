@@ -118,7 +118,7 @@ def test_hidden_object_gets_its_id_back_with_or_without_a_class(label: int) -> N
         depth, instances = render([board if not 8 <= frame < 36 else curtain])
         tracks = track_boards.track(depth, instances, frame / 30)
         for track in tracks:
-            track.mark_dynamic(frame / 30)
+            track.motion.mark_dynamic(frame / 30)
     assert [track.id for track in tracks] == [1]
 
 
@@ -448,7 +448,7 @@ def test_missed_furniture_that_has_moved_is_predicted() -> None:
     track_boards = BoardTracker()
     track_thrice(track_boards, Board(0.0, label=CHAIR))
     (track,) = track_boards.tracker.tracks
-    track.mark_dynamic(0.1)
+    track.motion.mark_dynamic(0.1)
     (predicted,) = track_boards(Board(0.0, label=CHAIR, detected=False))
     assert predicted is track and track.missed and bool(track.mask.any())
 

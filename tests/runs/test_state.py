@@ -56,7 +56,7 @@ def test_state_has_the_shifts_of_features(tmp_path: Path) -> None:
     for index in range(3):
         slam(walk[index])
     (track, *_) = slam.classify_motion._tracker.tracks
-    track.add_shift(track.newest.stamp, FeatureShift((3.0, 4.0), 0.5, torch.rand(12, 2)), 0.3)
+    track.motion.add_shift(track.newest.stamp, FeatureShift((3.0, 4.0), 0.5, torch.rand(12, 2)), 0.3)
     save_state(tmp_path / "slam.state", slam)
     loaded = load_state(tmp_path / "slam.state", segment_red)
     assert list(differences(slam.state_dict(), loaded.state_dict(), "state", {})) == []

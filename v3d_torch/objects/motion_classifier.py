@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
-from math import isnan
 from typing import Any
 
 import torch
@@ -29,6 +28,7 @@ from v3d_torch.objects.motion_evidence import (
     free_space_evidence,
     hough_vote_evidence,
 )
+from v3d_torch.objects.motion_state import decide_motion_state, is_held_dynamic
 from v3d_torch.objects.result_masks import result_masks
 from v3d_torch.objects.static_mask import static_masks
 from v3d_torch.objects.static_surfaces import StaticSurfaces
@@ -36,19 +36,7 @@ from v3d_torch.objects.surface_centroids import SurfaceCentroids
 from v3d_torch.objects.track import Track
 from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.segmentation.coco import LIVING, PERSON
-from v3d_torch.types import STAMP_TOLERANCE, Instances
-
-_STATIC_FRACTION = 0.1
-"""An object is at rest over a time span if less than this fraction of its pixels appeared: contours err by some
-hundredths of an object."""
-
-_MIN_MISSED_SCORE = 0.3
-"""A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones
-or one strong one: the network labels rotated furniture as people in single frames."""
-
-_MIN_SUPPORTED_TIME = 0.3
-"""The features on a static object fit the camera motion for at least this long, seconds. Between two frames those on a
-person fit it too, if the person walks slowly or along the line of sight."""
+from v3d_torch.types import Instances
 
 
 class MotionClassifier(StatefulComponent):
@@ -98,16 +86,14 @@ class MotionClassifier(StatefulComponent):
         evidence = self._collect_evidence(tracks, previous_stamp, view, appeared_pixels, feature_support)
 
         # Motion states, with memory over frames.
-        appeared_fractions = evidence.free_space.appeared_fractions
-        motion_states = {track: self._motion_state(track, appeared_fractions[track], stamp) for track in tracks}
+        fractions, config = evidence.free_space.appeared_fractions, self._config.static_mask
+        motion_states = {track: decide_motion_state(track, fractions[track], stamp, config) for track in tracks}
 
         # Masks, refined by depth, and the positions that they show.
         excluded = [track for track in tracks if not self._is_trackable(motion_states[track])]
         refined = self._refine_masks(excluded, tracks, view, appeared_pixels)
         size = view.missing.shape
-        masks = static_masks(
-            [refined[track] for track in excluded], list(refined.values()), size, self._config.static_mask
-        )
+        masks = static_masks([refined[track] for track in excluded], list(refined.values()), size, config)
         in_result = result_masks(tracks, refined, view.missing)
         self._record_visible_states(dict(zip(tracks, in_result, strict=True)), refined, view)
 
@@ -215,17 +201,17 @@ class MotionClassifier(StatefulComponent):
         # The camera motion is measured relative to the object with most features, such as a table that fills the image.
         with_most_inliers = self._rigid_with_most_inliers(tracks, feature_support.have_most_inliers(on_objects))
         self._add_shifts(tracks, with_most_inliers, feature_support, on_objects, view)
-        shifted = {track for track in tracks if track.last_shifted == stamp}
+        shifted = {track for track in tracks if track.motion.last_shifted == stamp}
         for track in (appeared | vote.dynamic | shifted) - with_most_inliers:
-            track.mark_dynamic(stamp)
+            track.motion.mark_dynamic(stamp)
         for track, is_supported in zip(tracks, feature_support.supports(on_objects).tolist(), strict=True):
-            track.mark_supported(stamp, is_supported)
+            track.motion.mark_supported(stamp, is_supported)
 
         # Intra-object motion by Chamfer distance (Sec. III-D) of the living objects that the vote leaves as static.
         candidates = self._deformation_candidates(pairs[config.chamfer.time_span], stamp)
         chamfer = chamfer_evidence(candidates, free_space, config.chamfer)
         for track in chamfer.deforming:
-            track.mark_deforming(stamp)
+            track.motion.mark_deforming(stamp)
         return MotionEvidence(free_space, vote, chamfer)
 
     def _refine_masks(
@@ -253,7 +239,7 @@ class MotionClassifier(StatefulComponent):
         return {
             track: pair
             for track, pair in pairs.items()
-            if track.label in LIVING and not self._is_held_dynamic(track, stamp)
+            if track.label in LIVING and not is_held_dynamic(track, stamp, self._config.static_mask)
         }
 
     def _add_shifts(
@@ -278,54 +264,12 @@ class MotionClassifier(StatefulComponent):
             return
         for track, shift in zip(tracks, feature_support.shifts(on_objects, view.missing.shape), strict=True):
             if track not in reference:
-                track.add_shift(view.stamp, shift, config.time_span)
+                track.motion.add_shift(view.stamp, shift, config.time_span)
 
     def _rigid_with_most_inliers(self, tracks: Sequence[Track], have_most_inliers: Tensor) -> set[Track]:
         """Return the rigid objects that have most of the inliers; people can have most of them on parts at rest."""
         flags = zip(tracks, have_most_inliers.tolist(), strict=True)
         return {track for track, has_most in flags if has_most and track.is_rigid}
-
-    def _motion_state(self, track: Track, appeared_fractions: list[float], stamp: float) -> MotionState:
-        """Return the motion state of an object.
-
-        Args:
-            track: Track of the object.
-            appeared_fractions: Fraction of the object's pixels that appeared, for each time span of the check.
-            stamp: Timestamp of the frame, seconds.
-        """
-        config = self._config.static_mask
-        # A shift counts for a while: features of a masked object are not matched, and free space shows no slow motions.
-        has_shifted = stamp - track.last_shifted <= config.hold_dynamic_time
-        if track.last_dynamic == stamp or has_shifted:
-            return MotionState.DYNAMIC
-        at_rest = [fraction < _STATIC_FRACTION for fraction in appeared_fractions]
-        at_rest_over_all = len(at_rest) > 0 and all(at_rest)
-        rarely_detected = track.total_score < _MIN_MISSED_SCORE and track.last_dynamic == -torch.inf
-        if track.missed and (at_rest_over_all or rarely_detected):
-            return MotionState.STATIC
-        # A walking person pauses, but a rigid thing that is at rest over all known time spans has stopped.
-        known = [rest for rest, fraction in zip(at_rest, appeared_fractions, strict=True) if not isnan(fraction)]
-        if track.has_rigid_label and known and all(known):
-            return MotionState.STATIC
-        if self._is_held_dynamic(track, stamp):
-            return MotionState.DYNAMIC
-        if stamp - track.last_deforming <= config.hold_dynamic_time:
-            return MotionState.DEFORMING
-        # Without a centroid, for example because the object is too far for its depth, its motion is never measured.
-        is_new = stamp - track.first_stamp < config.confirm_static_time or not track.newest.has_centroid
-        is_supported = stamp - track.supported_since >= _MIN_SUPPORTED_TIME - STAMP_TOLERANCE
-        if track.may_be_living and is_new and not at_rest_over_all and not is_supported:
-            return MotionState.UNKNOWN
-        return MotionState.STATIC
-
-    def _is_held_dynamic(self, track: Track, stamp: float) -> bool:
-        """Check whether there is evidence of an object's motion now, or was recently and in enough frames."""
-        config = self._config.static_mask
-        held = (
-            stamp - track.last_dynamic <= config.hold_dynamic_time
-            and track.dynamic_frames >= config.confirm_dynamic_frames
-        )
-        return held or track.last_dynamic == stamp
 
     def _is_trackable(self, motion_state: MotionState) -> bool:
         """Check whether tracking can use the pixels of an object with this motion state."""

@@ -1,4 +1,4 @@
-"""Track of one object over time: detections, predicted motion, masks and motion evidence."""
+"""Track of one object over time: detections, class, predicted motion and masks."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.se3 import transform_points
-from v3d_torch.objects.feature_shift import FeatureShift, sum_shifts
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.log_ratios import vacated_log_ratio
+from v3d_torch.objects.motion_record import MotionRecord
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.segmentation.coco import LIVING, RIGID, UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE
@@ -43,10 +43,6 @@ _CONFIRMING_DYNAMIC_FRAMES = 2
 
 _APPEARANCE_RATE = 0.1
 """Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
-
-_MIN_SHIFT_TIME = 1 / 3
-"""Minimum time over which shifts have been added up, as a fraction of the whole: the features of a single frame can all
-be matched wrongly, on a repeated pattern."""
 
 _DETECTION_TIME = 1.0
 """Detections are kept for this long, seconds. It bounds memory and the longest time span of the vote."""
@@ -85,9 +81,7 @@ class Track:
     """One object.
 
     The detections and the class are measured. A Kalman filter on the centroids predicts the position and the cloud. The
-    masks belong to the newest frame and are either measured or predicted, see ``missed``. ``last_dynamic`` records
-    evidence of motion by free space, votes or features, ``last_shifted`` that of features alone, ``last_deforming``
-    that of Chamfer distances.
+    masks belong to the newest frame and are either measured or predicted, see ``missed``.
 
     Args:
         config: Noise and maximum speed of the Kalman filter.
@@ -102,7 +96,6 @@ class Track:
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         is_shown: True if results show the object: it was detected in the newest frame, or is confirmed, was missed for
             a short time only, and the depth shows it at its predicted position.
-        is_confirmed: True if scores or motion have shown that the object exists.
         detections: Detections of the last second, newest last; after a longer gap the last two, if there are two.
         labels: Number of detections of each class. Once a detection had a score, those without one do not count.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
@@ -111,12 +104,7 @@ class Track:
         appearance_points: Mean number of points of the views in this histogram, with the same weights.
         vacated_time: Time since the last detection for which the predicted place was observed to be empty, seconds.
         vacated_log_ratio: Log-likelihood ratio of the empty place, see `log_ratios.vacated_log_ratio`.
-        dynamic_frames: Number of frames in which free space, votes or features showed a motion of the object.
-        last_dynamic: Timestamp of the last of these frames, seconds.
-        last_deforming: Timestamp of the last frame in which the object deformed, see `chamfer_evidence`, seconds.
-        supported_since: Timestamp of the first of the consecutive frames, up to the newest, in which its features fit
-            the camera motion, seconds; infinity if they do not fit in the newest frame.
-        last_shifted: Timestamp of the last frame in which its features had moved against the camera motion, seconds.
+        motion: Times at which there was evidence of its motion.
         history: States of the visible part after detections of the last 10 s, oldest first.
     """
 
@@ -128,7 +116,6 @@ class Track:
     coarse_mask: Tensor
     missed: bool = False
     is_shown: bool = True
-    is_confirmed: bool = False
     detections: list[Detection3D] = field(default_factory=list)
     labels: Counter[int] = field(default_factory=Counter)
     label: int = UNLABELLED
@@ -137,18 +124,13 @@ class Track:
     appearance_points: float = 0.0
     vacated_time: float = 0.0
     vacated_log_ratio: float = 0.0
-    dynamic_frames: int = 0
-    last_dynamic: float = -torch.inf
-    last_deforming: float = -torch.inf
-    supported_since: float = torch.inf
-    last_shifted: float = -torch.inf
+    motion: MotionRecord = field(default_factory=MotionRecord)
 
     def __post_init__(self, config: TrackerConfig) -> None:
         self.history: list[ObjectState] = []
         self._config = config
         self._filter = ConstantVelocityKalmanFilter(config)
         self._max_points = 1
-        self._shifts: list[tuple[float, FeatureShift]] = []  # by the time of the frame
         self._has_surface_centroid = False  # the position of the visible part is that of its refined mask
 
     @property
@@ -157,9 +139,15 @@ class Track:
         return self.detections[-1]
 
     @property
+    def is_confirmed(self) -> bool:
+        """True if scores or motion have shown that the object exists."""
+        has_moved = self.motion.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
+        return has_moved or self.total_score >= _MIN_CONFIRMED_SCORE
+
+    @property
     def may_move(self) -> bool:
         """True if the object may move by itself or has moved; false for furniture that was always at rest."""
-        return not self.is_rigid or self.last_dynamic > -torch.inf
+        return not self.is_rigid or self.motion.has_moved
 
     @property
     def has_rigid_label(self) -> bool:
@@ -319,8 +307,7 @@ class Track:
             stamp: Timestamp of the first detection afterwards, seconds.
         """
         self.first_stamp = stamp
-        self.supported_since = torch.inf
-        self._shifts = []
+        self.motion.restart()
         self.detections = []
 
     def update_label(self, label: int, score: float) -> None:
@@ -335,8 +322,6 @@ class Track:
         if score > 0 or self.total_score == 0:  # masks of a user can lack scores
             self.labels[label] += 1
         self.total_score += score
-        if self.total_score >= _MIN_CONFIRMED_SCORE:
-            self.is_confirmed = True
         named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
         self.label = (named or self.labels).most_common(1)[0][0]
 
@@ -368,36 +353,6 @@ class Track:
         """
         self.mask, self.cloud_pixels, self.coarse_mask = mask, cloud_pixels, coarse_mask
         self.missed, self.is_shown = missed, is_shown
-
-    def mark_dynamic(self, stamp: float) -> None:
-        """Record that the frame at ``stamp``, seconds, shows a motion of the object."""
-        self.last_dynamic = stamp
-        self.dynamic_frames += 1
-        self.is_confirmed = self.is_confirmed or self.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
-
-    def add_shift(self, stamp: float, shift: FeatureShift | None, time_span: float) -> None:
-        """Add the shift of the features on the object in a frame, and record a motion if the sum shows one.
-
-        Args:
-            stamp: Timestamp of the frame, seconds.
-            shift: Shift since the previous frame; None if it is not known.
-            time_span: Time over which shifts are added up, seconds.
-        """
-        self._shifts = [each for each in self._shifts if stamp - each[0] < time_span + STAMP_TOLERANCE]
-        if shift is None:
-            return
-        self._shifts.append((stamp, shift))
-        is_long = stamp - self._shifts[0][0] >= _MIN_SHIFT_TIME * time_span - STAMP_TOLERANCE
-        if is_long and sum_shifts(each for _, each in self._shifts).is_motion:
-            self.last_shifted = stamp
-
-    def mark_deforming(self, stamp: float) -> None:
-        """Record that the object deforms in the frame at ``stamp``, seconds."""
-        self.last_deforming = stamp
-
-    def mark_supported(self, stamp: float, is_supported: bool) -> None:
-        """Record whether the features on the object fit the camera motion in the frame at ``stamp``, seconds."""
-        self.supported_since = min(self.supported_since, stamp) if is_supported else torch.inf
 
     def apply_world_correction(self, T_new_old: Tensor, since: float = -torch.inf) -> None:
         """Transform the track, or what was measured since some time, into the corrected world.

@@ -18,6 +18,7 @@ from v3d_torch.mapping.keyframe import Keyframe, Loop
 from v3d_torch.objects.depth_view import StoredView
 from v3d_torch.objects.feature_shift import FeatureShift
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
+from v3d_torch.objects.motion_record import MotionRecord
 from v3d_torch.objects.object_state import ObjectState
 from v3d_torch.objects.track import Detection3D, Track
 from v3d_torch.occupancy.floor import Floor
@@ -36,8 +37,8 @@ from v3d_torch.types import RGBDFrame, Segmenter, TrackingStatus
 STATE_CLASSES: tuple[type, ...] = (
     TrackedFrame, RGBDFrame, PinholeCamera, Features, PosePrediction, TrackingStatus, CameraState,
     Keyframe, Loop, TensorTable, Readout, StageTime,
-    StoredView, Track, Detection3D, FeatureShift, ConstantVelocityKalmanFilter, ObjectState, TrackerConfig,
-    RangeView, Floor, UpDirection,
+    StoredView, Track, Detection3D, MotionRecord, FeatureShift, ConstantVelocityKalmanFilter, ObjectState,
+    TrackerConfig, RangeView, Floor, UpDirection,
 )  # fmt: skip
 """Classes of the package that a saved state can contain; others are not read."""
 
