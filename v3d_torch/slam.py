@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import partial
 from typing import Any, NoReturn
 
@@ -44,7 +44,12 @@ from v3d_torch.runtime.input_checks import check_next
 from v3d_torch.runtime.stage_timer import StageTimer
 from v3d_torch.runtime.stateful import Stateful
 from v3d_torch.segmentation import NoSegmentation
-from v3d_torch.segmentation.segmenter import innermost_segmenter, restore_segmenter, segmenter_state_of
+from v3d_torch.segmentation.segmenter import (
+    innermost_segmenter,
+    restore_segmenter,
+    segmenter_state_of,
+    without_empty_masks,
+)
 from v3d_torch.stages.frame_preprocessor import PREFETCHED_FRAMES, FramePreprocessor
 from v3d_torch.stages.protocols import (
     AppearanceStage,
@@ -291,7 +296,9 @@ class V3DSLAM(FramePreprocessor):
                 self.occupancy(depth, objects.static_mask, self.poses, self.up_estimator.estimate(), T_dc)
         # The world frame can have been corrected after the objects were tracked.
         objects = self.classify_motion.correct_result(objects)
-        return FrameResult(**vars(objects), **vars(state), T_dc=T_dc)
+        parts = (objects, FrameObjects), (state, CameraState)  # a stage can return a subclass with other attributes
+        values = {each.name: getattr(part, each.name) for part, kind in parts for each in fields(kind)}
+        return FrameResult(**values, T_dc=T_dc)
 
     def _track_objects(
         self, preprocessed: PreprocessedFrame, features: Features, motion: CameraMotion, T_dc: Tensor
@@ -450,7 +457,8 @@ class V3DSLAM(FramePreprocessor):
             instances = self.classify_motion.propagate_instances(view)
         if not self._proposes_objects:
             return instances
-        return instances.concatenate(self.propose_unlabelled(appeared_pixels, instances, view.depth))
+        proposed = self.propose_unlabelled(appeared_pixels, instances, view.depth)
+        return instances.concatenate(without_empty_masks(proposed))
 
     def _append_pose(
         self,

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,16 @@ class RGBDFrame:
     camera: PinholeCamera | None = None
     depth_delay: float = 0.0
     gravity: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        # Numbers of NumPy become Python's, because a saved state has no others; V3DSLAM rejects other types.
+        index: object = self.index
+        if isinstance(index, Integral):
+            object.__setattr__(self, "index", int(index))
+        times: dict[str, object] = {"stamp": self.stamp, "depth_delay": self.depth_delay}
+        for name, seconds in times.items():
+            if isinstance(seconds, Real):
+                object.__setattr__(self, name, float(seconds))
 
     @staticmethod
     def from_arrays(

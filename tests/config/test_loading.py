@@ -69,6 +69,7 @@ def test_dumped_configuration_loads_as_the_same(tmp_path: Path) -> None:
         ("objects.free_space.min_tolerance=1e-9", "min_tolerance: input should be greater than or equal to 0.001"),
         ("dense_map.voxel_size=1e-9", "dense_map.voxel_size: input should be greater than or equal to 0.001"),
         ("dense_map.mesh.voxel_size=1e-9", "mesh.voxel_size: input should be greater than or equal to 0.005"),
+        ("objects.tracker.acceleration_noise=.inf", "acceleration_noise: input should be a finite number, got inf"),
         ("objects.clouds.voxel_size=.inf", "clouds.voxel_size: input should be a finite number, got inf"),
         ("dense_map.voxel_size=.inf", "dense_map.voxel_size: input should be a finite number, got inf"),
         ("dense_map.mesh.voxel_size=.inf", "mesh.voxel_size: input should be a finite number, got inf"),

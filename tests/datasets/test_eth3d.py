@@ -10,6 +10,7 @@ from helpers.tiny_images import HEIGHT, WIDTH, colour_of, depth_of, save
 
 from v3d_torch.datasets import load_sequence
 from v3d_torch.datasets.eth3d import ETH3DSequence
+from v3d_torch.datasets.tum import TUMSequence
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -45,7 +46,11 @@ def test_camera_of_the_user_takes_precedence(folder: Path) -> None:
     assert (camera.fx, camera.depth_scale, camera.readout) == (30.0, 1000.0, None)
 
 
-def test_damaged_camera_file_is_rejected(folder: Path) -> None:
-    (folder / "calibration.txt").write_text("726.2 726.2\n")
-    with pytest.raises(InputError, match=r"calibration.txt: contains 2 numbers that do not form a camera"):
+@pytest.mark.parametrize("content", ["726.2 726.2\n", "calibrated on Monday", "30 31 15 11 1000 32 24"])
+def test_folder_with_another_file_of_this_name_is_in_plain_tum_layout(folder: Path, content: str) -> None:
+    (folder / "calibration.txt").write_text(content)
+    with pytest.raises(InputError, match=r"has no camera parameters; add a camera\.yaml"):
         load_sequence(folder)
+    (folder / "K.txt").write_text(f"30 31 15 11 1000 {WIDTH} {HEIGHT}\n")
+    sequence = load_sequence(folder)
+    assert type(sequence) is TUMSequence and sequence.camera.depth_scale == 1000.0

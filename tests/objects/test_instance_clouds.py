@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from sklearn.cluster import DBSCAN
@@ -297,3 +299,11 @@ def test_repeated_results_are_identical() -> None:
     )
     assert first.points.numpy().tobytes() == second.points.numpy().tobytes()
     assert first.centroid.numpy().tobytes() == second.centroid.numpy().tobytes()
+
+
+def test_image_of_one_coarse_row_has_clouds() -> None:
+    camera = replace(CAMERA, height=96, cy=48.0)
+    depth = torch.full((1, 96, camera.width), 2.0)
+    whole = Instances.from_masks(torch.ones(1, 96, camera.width, dtype=torch.bool), torch.tensor([0]))
+    clouds = InstanceBackProjector(CloudConfig(stride=100), camera)(depth, whole)
+    assert len(clouds) == 1

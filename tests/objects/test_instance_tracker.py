@@ -653,6 +653,24 @@ def test_detections_of_a_pair_are_at_least_the_time_span_apart() -> None:
         assert current.stamp - previous.stamp == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(("rate", "jitter"), [(30.0, 0.003), (5.0, 0.003), (3.5, 0.0), (2.3, 0.0)])
+@pytest.mark.parametrize("time_span", [0.9, 1.0])
+def test_detections_over_the_longest_time_spans_are_compared_at_any_rate(
+    rate: float, jitter: float, time_span: float
+) -> None:
+    """A detection that is older than a second is kept while no other is old enough."""
+    jitters = jitter * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    mask, centroid = torch.zeros(1, 1, dtype=torch.bool), torch.zeros(3, dtype=torch.float64)
+    track = Track(1, 0.0, TrackerConfig(), mask, mask, torch.zeros(8, dtype=torch.uint8))
+    for number, noise in enumerate(jitters.tolist()):
+        stamp = number / rate + noise
+        track.add_detection(Detection3D(stamp, centroid, torch.zeros(5, 3)))
+        if stamp > 1.0 + 1 / rate:
+            pair = track.detection_pair(time_span)
+            assert pair is not None and pair[1].stamp - pair[0].stamp < time_span + 1.2 / rate + 4 * jitter
+    assert len(track.detections) <= rate * (1 + 4 * jitter) + 2
+
+
 def test_detection_pair_needs_both_centroids() -> None:
     track_boards = BoardTracker()
     for no_depth in (False, True, False, False):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import copy
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from helpers.differences import differences
@@ -12,7 +14,7 @@ from helpers.walk_with_loop import CAMERA, CONFIG, Walk, interrupt_after, make_p
 
 from v3d_torch import V3DSLAM, load_state, save_state
 from v3d_torch.config.loading import load_config
-from v3d_torch.errors import ConfigError, InputError, StageWarning
+from v3d_torch.errors import ConfigError, InputError, OutputError, StageWarning
 from v3d_torch.io.state_file import write_state
 from v3d_torch.objects.feature_shift import FeatureShift
 from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
@@ -20,6 +22,7 @@ from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
 from v3d_torch.segmentation.segmenter import segmenter_state_of
+from v3d_torch.types import Instances, RGBDFrame
 
 
 def test_loaded_system_equals_the_saved_one(tmp_path: Path) -> None:
@@ -121,3 +124,32 @@ def test_file_without_the_state_of_a_system_is_rejected(tmp_path: Path) -> None:
         InputError, match=r"slam\.state: is not the state of a system; pass a file that save_state wrote"
     ):
         load_state(tmp_path / "slam.state")
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.uint8])
+def test_frames_with_numbers_of_numpy_leave_a_state_that_can_be_loaded(tmp_path: Path, kind: type) -> None:
+    slam = V3DSLAM(CAMERA, segment_red)
+    for index in range(3):
+        frame = Walk()[index]
+        slam(replace(frame, index=kind(index), stamp=np.float32(frame.stamp), depth_delay=np.float64(0)))
+    save_state(tmp_path / "slam.state", slam)
+    loaded = load_state(tmp_path / "slam.state", segment_red)
+    assert loaded.poses.stamp == slam.poses.stamp and type(loaded.poses.stamp) is float
+
+
+def test_state_that_cannot_be_loaded_is_not_saved(tmp_path: Path) -> None:
+    class Remembering:
+        def __call__(self, frame: RGBDFrame) -> Instances:
+            return segment_red(frame)
+
+        def state_dict(self) -> dict[str, object]:
+            return {"last": np.ones(3)}
+
+        def load_state_dict(self, state: object) -> None:
+            pass
+
+    slam = V3DSLAM(CAMERA, Remembering())
+    slam(Walk()[0])
+    with pytest.raises(OutputError, match=r"slam\.state: the state has objects that cannot be loaded again \(numpy"):
+        save_state(tmp_path / "slam.state", slam)
+    assert list(tmp_path.iterdir()) == []

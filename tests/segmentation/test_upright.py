@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.segmentation.upright import UprightSegmenter
-from v3d_torch.types import Instances
+from v3d_torch.types import Instances, RGBDFrame
 
 
 def rolled(degrees: float) -> Tensor:
@@ -205,3 +206,25 @@ def test_votes_of_a_call_do_not_change_those_of_the_call_before() -> None:
     upright.segment_with_pose(make_frame(0, 1), IDENTITY)
     votes = upright.up_votes
     assert torch.equal(before, expected) and votes.norm() > 0.5 and votes[0].abs() > votes[1].abs()
+
+
+def test_state_contains_that_of_the_segmenter_inside() -> None:
+    class Counter(Network):
+        calls = 0
+
+        def __call__(self, frame: RGBDFrame) -> Instances:
+            self.calls += 1
+            return super().__call__(frame)
+
+        def state_dict(self) -> dict[str, int]:
+            return {"calls": self.calls}
+
+        def load_state_dict(self, state: Mapping[str, int]) -> None:
+            self.calls = state["calls"]
+
+    upright, loaded = UprightSegmenter(Counter()), UprightSegmenter(Counter())
+    for index in range(3):
+        upright.segment_with_pose(make_frame(index, 0), IDENTITY)
+    loaded.load_state_dict(upright.state_dict())
+    assert isinstance(loaded.wrapped, Counter) and isinstance(upright.wrapped, Counter)
+    assert loaded.wrapped.calls == upright.wrapped.calls > 3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from v3d_torch.config.loading import load_config, override_config
 from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.depth_smoother import DepthSmoother
+from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.odometry.odometry import Odometry
 from v3d_torch.runs.numerics_check import CheckedSLAM
 from v3d_torch.segmentation import make_segmenter
@@ -92,6 +93,18 @@ WRONG: list[tuple[str, Callable[[Any], Any], str]] = [
     ),
     ("propose_unlabelled", lambda _: [], "propose_unlabelled returned a list; it must return Instances"),
     ("propose_unlabelled", change(masks=lambda x: x[..., 1:]), r"propose_unlabelled\.masks .* shape \(N, 48, 64\)"),
+    (
+        "propose_unlabelled",
+        lambda _: Instances.from_masks(torch.ones(1, 48, 64).bool(), torch.tensor([200])),
+        r"propose_unlabelled\.labels has values that are not classes of COCO or -1$",
+    ),
+    (
+        "propose_unlabelled",
+        lambda _: replace(
+            Instances.from_masks(torch.ones(1, 48, 64).bool(), torch.tensor([-1])), track_ids=torch.tensor([7])
+        ),
+        r"propose_unlabelled\.track_ids is a Tensor, expected a NoneType$",
+    ),
     ("back_project_instances", change(points=torch.Tensor.double), r"instances\.points is torch.float64 of shape \(2,"),
     ("back_project_instances", change(centroid=lambda x: x[:1]), r"\.centroid is .* \(1, 3\), expected .* \(2, 3\)"),
     ("classify_motion", lambda _: (), "classify_motion returned a tuple; it must return FrameObjects"),
@@ -382,3 +395,43 @@ def test_configured_segmenter_excludes_other_sources(option: str, source: str, a
     config = configure("stages.segment=lab:Segmenter", f"segmentation.source={source}")
     with pytest.raises(ConfigError, match=rf"^{option}: not used with stages.segment=lab:Segmenter; re"):
         make_segmenter(config, CAMERA, **arguments)
+
+
+def test_proposals_without_pixels_are_left_out() -> None:
+    slam = make_slam()
+    nothing = Instances.from_masks(torch.zeros(1, 48, 64).bool(), torch.tensor([-1]))
+    expected = [[each.id for each in make_slam()(FRAMES[0]).objects]]
+    slam.propose_unlabelled = lambda *_: nothing
+    assert [[each.id for each in slam(FRAMES[0]).objects]] == expected
+
+
+def test_result_of_a_stage_can_have_further_attributes() -> None:
+    @dataclass(frozen=True)
+    class Marked(FrameObjects):
+        mark: int = 3
+
+    slam = make_slam()
+    classify = slam.classify_motion
+
+    class Own:
+        def __call__(self, *args: Any) -> FrameObjects:
+            return Marked(**vars(classify(*args)))
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(classify, name)
+
+    slam.classify_motion = Own()
+    assert slam(FRAMES[0]).static_mask.shape == (48, 64)
+
+
+def test_length_of_the_vectors_of_appearance_can_change() -> None:
+    """As after the built-in histograms of a loaded state."""
+    slam, lengths = make_slam(), iter((3, 4, 4))
+
+    def describe(image: torch.Tensor, masks: torch.Tensor) -> torch.Tensor:
+        length = next(lengths)
+        return torch.full((len(masks), length), 1 / length)
+
+    slam.describe_appearance = describe
+    ids = [[each.id for each in slam(frame).objects] for frame in FRAMES]
+    assert ids[0] == ids[1] == ids[2] != []

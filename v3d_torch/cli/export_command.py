@@ -84,7 +84,7 @@ def export_run(folder: Path, out: Path, options: ExportOptions, seq: str | None,
     with progress_bars(console) as progress:
         source = open_images(run, request, ProgressBar(progress, "sequence"))
     frames = _select_frames(run, options)
-    images = posed_images(run, source, frames, masks=options.masks)
+    images = posed_images(run, source, frames, masks=options.masks, masks_needed=options.format == "tum")
     other_name = note_other_name(run, source)
     shown: Iterable[PosedImage] = track(
         images, "exporting", len(frames), console=console, disable=not console.is_terminal

@@ -94,7 +94,7 @@ class TrackerConfig(Section):
     max_jump: float = Field(0.5, gt=0)
     """Maximum jump of a centroid, metres, in addition to its motion: the centroid also jumps when an object is cut off
     by the image border or occluded."""
-    acceleration_noise: float = Field(1.2, gt=0)
+    acceleration_noise: float = Field(1.2, gt=0, allow_inf_nan=False)
     """Square root of the spectral density of the acceleration, m/s^1.5, which is the standard deviation of the change
     of velocity in one second: a person can stop or turn within a second."""
     min_overlap: float = Field(0.4, ge=0, le=1)

@@ -11,7 +11,10 @@ from v3d_torch.datasets.image_files import list_images
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.locate import is_tum
 from v3d_torch.datasets.tum import TUMSequence
+from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.io.numbers import parse_number
+from v3d_torch.io.text_file import read_text
 
 _DEPTH_SCALE = 5000.0
 """Depth units per metre."""
@@ -39,8 +42,17 @@ class ETH3DSequence(TUMSequence):
 
 
 def is_eth3d(path: Path) -> bool:
-    """Check whether a folder contains the lists of the TUM layout and the camera file of the benchmark."""
-    return is_tum(path) and (path / _CAMERA_FILE).is_file()
+    """Check whether a folder contains the lists of the TUM layout, and four numbers in the camera file."""
+    return is_tum(path) and (path / _CAMERA_FILE).is_file() and _has_four_numbers(path / _CAMERA_FILE)
+
+
+def _has_four_numbers(path: Path) -> bool:
+    """Check the content of a file; other recordings can have files of this name."""
+    try:
+        numbers = [parse_number(word) for word in read_text(path, "it contains fx fy cx cy").split()]
+    except (InputError, ValueError):
+        return False
+    return len(numbers) == 4
 
 
 def _published_camera(folder: Path) -> PinholeCamera:

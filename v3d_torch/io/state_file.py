@@ -17,7 +17,7 @@ from typing import IO, Any, cast
 
 import torch
 
-from v3d_torch.errors import InputError
+from v3d_torch.errors import InputError, OutputError
 from v3d_torch.io.files import atomic_write
 
 _FORMAT = "v3d_torch state"
@@ -31,27 +31,43 @@ _PLACEHOLDER_DIGEST = "0" * hashlib.sha256().digest_size * 2
 _BLOCK_SIZE = 1 << 20
 
 
-def write_state(path: Path, metadata: Mapping[str, Any], state: object) -> None:
+def write_state(path: Path, metadata: Mapping[str, Any], state: object, classes: Sequence[type] | None = None) -> None:
     """Write a state file atomically and durably: after a power failure the file contains the old or the new state.
 
     Args:
         path: File to write.
         metadata: Plain values that `read_state` returns next to the state.
         state: Tensors, containers and objects; objects that are shared stay shared after loading.
+        classes: Classes with which it will be read, see `read_state`; None to write any others, too.
 
     Raises:
-        OutputError: If the file cannot be written.
+        OutputError: If the file cannot be written, or has objects of other classes.
     """
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("w+b") as file:
         file.write(_FIRST_LINE.format(version=VERSION, digest=_PLACEHOLDER_DIGEST).encode())
         hashed = _HashingWriter(file)
         hashed.write(json.dumps({"v3d-torch": version("v3d-torch"), **metadata}).encode() + b"\n")
         torch.save(state, cast("IO[bytes]", hashed))  # torch.save only calls write and flush
         hashed.raise_error()
+        if classes is not None:
+            _check_classes(path, file, classes)
         file.seek(0)
         file.write(_FIRST_LINE.format(version=VERSION, digest=hashed.digest).encode())
         file.flush()
         os.fsync(file.fileno())  # the rename can reach the disk before the content otherwise
+
+
+def _check_classes(path: Path, file: IO[bytes], classes: Sequence[type]) -> None:
+    """Raise OutputError if a state file has objects that cannot be read with these classes."""
+    file.seek(0)
+    file.readline(), file.readline()
+    with torch.serialization.safe_globals(list(classes)):
+        others = torch.serialization.get_unsafe_globals_in_checkpoint(file)
+    if others:
+        raise OutputError(
+            f"{path}: the state has objects that cannot be loaded again ({', '.join(sorted(others))}); let the"
+            " state_dict of stages return tensors, numbers and texts, and lists and dictionaries of them"
+        )
 
 
 def read_state(path: Path, classes: Sequence[type]) -> tuple[dict[str, Any], Any]:

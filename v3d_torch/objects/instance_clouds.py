@@ -56,7 +56,7 @@ class InstanceBackProjector:
 
     def __init__(self, config: CloudConfig, camera: PinholeCamera) -> None:
         self._config = config
-        self._rays = camera.rays[:: config.stride, :: config.stride].reshape(-1, 3).numpy()
+        self._rays = camera.rays[:: config.stride, :: config.stride].reshape(-1, 3).contiguous().numpy()
 
     def __call__(self, depth: Tensor, instances: Instances) -> InstanceClouds:
         """Compute the clouds of all instances of a frame at once.

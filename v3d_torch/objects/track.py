@@ -45,7 +45,7 @@ _APPEARANCE_RATE = 0.1
 """Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
 
 _DETECTION_TIME = 1.0
-"""Detections are kept for this long, seconds. It bounds memory and the longest time span of the vote."""
+"""Detections are kept for this long, and one before, seconds: the longest time span of the vote. It bounds memory."""
 
 _STATE_HISTORY, _HISTORY_INTERVAL = 10.0, 0.1 - 1e-3
 """Length of the history of states, and minimum time between two of them, seconds: for planners and drawings."""
@@ -96,7 +96,7 @@ class Track:
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         is_shown: True if results show the object: it was detected in the newest frame, or is confirmed, was missed for
             a short time only, and the depth shows it at its predicted position.
-        detections: Detections of the last second, newest last; after a longer gap the last two, if there are two.
+        detections: Detections of the last second and the one before, newest last.
         labels: Number of detections of each class. Once a detection had a score, those without one do not count.
         label: Class of most detections. A class takes precedence over `UNLABELLED`, however often that was detected.
         total_score: Sum of the scores of all detections.
@@ -262,7 +262,8 @@ class Track:
         self._filter.update(detection.stamp, detection.centroid, self.centroid_sigma(detection))
         self.vacated_time = self.vacated_log_ratio = 0.0
         self.detections.append(detection)
-        while self.detections[0].stamp < oldest and len(self.detections) > 2:
+        oldest_needed = detection.stamp - _DETECTION_TIME + STAMP_TOLERANCE  # one detection before it is kept
+        while len(self.detections) > 2 and self.detections[1].stamp <= oldest_needed:
             self.detections.pop(0)
 
     def record_visible_state(self, surface_centroid: Tensor | None) -> None:
@@ -333,7 +334,7 @@ class Track:
         """
         if bool(histogram[0].isnan()):
             return
-        if self.appearance is None:
+        if self.appearance is None or len(self.appearance) != len(histogram):  # as after another stage was set
             self.appearance, self.appearance_points = histogram, float(len(self.newest.cloud))
         else:
             self.appearance = self.appearance.lerp(histogram, _APPEARANCE_RATE)

@@ -249,7 +249,8 @@ def _appearance_log_ratio(
     if detected.appearance is None:
         return torch.zeros(len(tracks), len(detected), dtype=torch.float64)
     unknown = torch.full_like(detected.appearance[0], torch.nan)
-    appearance = torch.stack([unknown if track.appearance is None else track.appearance for track in tracks])
+    known = [track.appearance for track in tracks]
+    appearance = torch.stack([unknown if each is None or each.shape != unknown.shape else each for each in known])
     similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
     elapsed = _elapsed(tracks, detected)
     tracked = torch.tensor(tracked_points, dtype=torch.float64)[:, None]

@@ -122,7 +122,7 @@ def write_checkpoint(
         metadata |= {"sequence": _fingerprint(sequence, done, sizes), "frames": len(pipeline.slam.poses)}
         metadata["segmentation"] = {} if segmentation is None else segmentation.fingerprint(done)
         state = pipeline.state_dict()
-    write_state(folder / RunFile.CHECKPOINT, metadata, state)
+    write_state(folder / RunFile.CHECKPOINT, metadata, state, _CLASSES)
 
 
 def is_finished(folder: Path) -> bool:

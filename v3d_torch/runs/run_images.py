@@ -112,7 +112,9 @@ def localised_frames(run: StoredRun, *, only_keyframes: bool = False) -> Localis
     return LocalisedFrames([table[position]["frame"] for position in rows], poses)
 
 
-def posed_images(run: StoredRun, source: RGBDStream, frames: LocalisedFrames, *, masks: bool) -> Iterator[PosedImage]:
+def posed_images(
+    run: StoredRun, source: RGBDStream, frames: LocalisedFrames, *, masks: bool, masks_needed: bool = False
+) -> Iterator[PosedImage]:
     """Read frames with their poses and masks, one after the other.
 
     Args:
@@ -120,6 +122,7 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocalisedFrames, *,
         source: Images of the run.
         frames: Frames to read.
         masks: True to read the masks that the run saved; False for masks that exclude nothing.
+        masks_needed: True if the masks cannot be left out, for the error message.
 
     Returns:
         Iterator over the frames, which raises an InputError if an image cannot be read or is not from the run.
@@ -129,9 +132,8 @@ def posed_images(run: StoredRun, source: RGBDStream, frames: LocalisedFrames, *,
     """
     folder = run.folder / MAP_MASKS
     if masks and not folder.is_dir():
-        raise InputError(
-            f"{run.folder}: has no masks; run the sequence again with --save-masks, or do not mask with --no-masks"
-        )
+        alternative = "" if masks_needed else ", or do not mask with --no-masks"
+        raise InputError(f"{run.folder}: has no masks; run the sequence again with --save-masks{alternative}")
     if isinstance(source, RGBDSequence) and frames.indices[-1] >= len(source):
         raise InputError(
             f"{source.name}: has {len(source)} frames, fewer than the run; pass the sequence of this run with --seq"

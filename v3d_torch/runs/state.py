@@ -51,13 +51,13 @@ def save_state(path: StrPath, slam: V3DSLAM) -> None:
         slam: System, between two frames.
 
     Raises:
-        OutputError: If the file cannot be written.
+        OutputError: If the file cannot be written, or the state of a replaced stage cannot be loaded again.
         ConfigError: If a stage was replaced by one without state_dict.
     """
     config = slam.config.model_dump(mode="json")
     replaced = [name for name in slam.replaced_stages if name not in slam.config.stages.paths]
     metadata = {"config": config, "camera": asdict(slam.camera), "replaced": replaced}
-    write_state(Path(path), metadata, slam.state_dict())
+    write_state(Path(path), metadata, slam.state_dict(), STATE_CLASSES)
 
 
 def load_state(path: StrPath, segment: Segmenter | None = None, stages: StagesConfig | None = None) -> V3DSLAM:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from v3d_torch.runtime.input_checks import check_instances
 from v3d_torch.segmentation.coco import LABELS
+from v3d_torch.segmentation.segmenter import restore_segmenter, segmenter_state_of
 from v3d_torch.types import Instances, RGBDFrame, Segmenter
 
 _PRIOR_WEIGHT = 0.5
@@ -107,12 +108,13 @@ class UprightSegmenter:
         return candidates.get(self._upright_turns(T_cw), candidates[turns])
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of calls and the sum of votes for the up direction, see `Stateful`."""
-        return {"calls": self._calls, "up": self._up.clone()}
+        """Return the number of calls, the votes for the up direction and the state of the wrapped segmenter."""
+        return {"calls": self._calls, "up": self._up.clone(), "wrapped": segmenter_state_of(self.wrapped)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         self._calls, self._up = state["calls"], state["up"].clone()
+        restore_segmenter(self.wrapped, state.get("wrapped"))
 
     def _other_turns(self) -> list[int]:
         """Turns to segment beside the upright one, counted from it: all in the first call, later one or none.

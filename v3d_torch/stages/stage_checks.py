@@ -16,9 +16,14 @@ from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.odometry.odometry import CameraMotion, TrackedFrame
 from v3d_torch.runtime.input_checks import INSTANCES, TensorSpec, describe_type, describe_wrong_tensor, fill_in
 from v3d_torch.runtime.stage_proxy import STATE_METHODS, CheckingProxy
-from v3d_torch.runtime.value_rules import FINITE, HISTOGRAMS, IDS, NOT_NEGATIVE, PAIRS, PIXELS, POSITIVE, RIGID
+from v3d_torch.runtime.value_rules import FINITE, HISTOGRAMS, IDS, NOT_NEGATIVE, PAIRS, PIXELS, POSITIVE, RIGID, Rule
+from v3d_torch.segmentation.coco import LABELS
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import FramePose, Instances, TrackingStatus
+
+_CLASSES = Rule(
+    "classes of COCO or -1", lambda values, sizes: bool(((values >= LABELS.start) & (values < LABELS.stop)).all())
+)
 
 _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
     Features: {
@@ -38,7 +43,7 @@ _FIELDS: Mapping[type, Mapping[str, TensorSpec | type]] = {
         "is_measured": bool,
     },
     AppearedPixels: {"was_free": TensorSpec(torch.float64, ("B", "h", "w")), "stride": int},
-    Instances: INSTANCES,
+    Instances: {**INSTANCES, "labels": TensorSpec(torch.int64, ("N",), _CLASSES), "track_ids": type(None)},
     InstanceClouds: {
         "points": TensorSpec(torch.float32, ("N", "P", 3)),
         "valid": TensorSpec(torch.bool, ("N", "P")),
