@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import gc
 import itertools
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from queue import SimpleQueue
 from threading import Thread
@@ -63,13 +63,14 @@ class SlamNode(Node):
         """Publish the messages of a tracked frame, and sometimes the grid."""
         self._publish([*self._messages.of_frame(result.frame, result, self.slam)])
         if len(self.slam.poses) % GRID_INTERVAL == 0:
-            self.worker.submit(lambda: self._publish([*self._messages.of_grid(self.slam)]))
+            published = self.worker.submit(lambda: self._publish([*self._messages.of_grid(self.slam)]))
+            published.add_done_callback(Future.result)  # logs the error, if there was one
 
     def _add_frame(self, colour: Image, depth: Image) -> None:
         time, depth_time = (each.header.stamp.sec + 1e-9 * each.header.stamp.nanosec for each in (colour, depth))
-        stamp = time + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
         try:
             images = decode_colour_message(colour, COLOUR).permute(1, 2, 0), decode_depth_message(depth, DEPTH)
+            stamp = time + 3e-7  # never rounded to before the image, so that tf2 finds its pose without waiting
             arguments = next(self._indices), stamp, *images, self.slam.camera
             self.frames.put(v3d.RGBDFrame.from_arrays(*arguments, depth_delay=depth_time - time))
         except v3d.InputError as error:
@@ -77,11 +78,10 @@ class SlamNode(Node):
 
     def _publish(self, messages: list[TopicMessage]) -> None:
         for topic, message in messages:
-            if topic.endswith("camera_info"):  # the driver publishes it
-                continue
-            if topic not in self._topics:
+            if topic not in self._topics and not topic.endswith("camera_info"):  # which the driver publishes
                 self._topics[topic] = self.create_publisher(get_message(message.__msgtype__), topic, QOS.get(topic, 10))
-            self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
+            if topic in self._topics:
+                self._topics[topic].publish(bytes(self._store.serialize_cdr(message, message.__msgtype__)))
 
 
 def main() -> None:

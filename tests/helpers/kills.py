@@ -13,7 +13,7 @@ from v3d_torch.slam import V3DSLAM
 
 def kill_while_tracking(frame: int) -> None:
     """Kill this process in the middle of the tracking of a frame, counted from 1."""
-    _kill_at(V3DSLAM, "_extend_map", frame, lambda *_: True)
+    _kill_at(V3DSLAM, "_append_pose", frame, lambda *_: True)
 
 
 def kill_before_renaming(name: str, time: int) -> None:
