@@ -105,7 +105,10 @@ class OccupancyMapper(StatefulComponent):
             self.floor = self.find_floor() or self.floor
 
     def find_floor(self) -> Floor | None:
-        """Find the floor of the map as it is now; None if none is visible. It takes up to a tenth of a second."""
+        """Find the floor of the map as it is now; None if none is visible.
+
+        It takes 0.1 s in a room, and half a second in a map of 30 m.
+        """
         return find_floor(self.map, self.up)
 
     def grid(self, heights: tuple[float, float] | None = None) -> OccupancyGrid | None:
