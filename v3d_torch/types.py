@@ -353,6 +353,14 @@ class Trajectory:
     def __len__(self) -> int:
         return self.stamps.shape[0]
 
+    def select(self, rows: slice | Sequence[int] | Tensor) -> Trajectory:
+        """Return some of the poses.
+
+        Args:
+            rows: Slice, ascending indices, or mask, bool, shape :math:`(N,)`.
+        """
+        return Trajectory(self.stamps[rows], self.T_wc[rows])
+
     def poses_at(self, stamps: Tensor | Sequence[float]) -> Tensor:
         """Return the poses at given times, interpolated between the nearest poses before and after.
 

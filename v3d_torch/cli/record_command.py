@@ -21,8 +21,7 @@ from v3d_torch.runs.print_line import print_line
 from v3d_torch.runs.progress_bar import TrackingBar, progress_bars
 from v3d_torch.runs.system import check_map_is_given, make_system
 from v3d_torch.segmentation import make_segmenter
-from v3d_torch.slam import V3DSLAM
-from v3d_torch.types import RGBDFrame, Trajectory
+from v3d_torch.types import RGBDFrame
 
 
 def record_all(source: RGBDStream, out: Path, interrupted: Event, console: Console) -> int:
@@ -98,15 +97,8 @@ def record_static(
         with torch.inference_mode():
             slam.flush()
         if len(writer):
-            known = _known_poses(slam)
+            known = slam.poses.trajectory().select(slam.poses.localised)
             recording.write_poses(known)
             if unknown := len(slam.poses) - len(known):
                 print_line(console, f"note: {unknown} frames without a known pose are left out of {ESTIMATE}")
     return len(writer), None if record.interrupted else record.failure
-
-
-def _known_poses(slam: V3DSLAM) -> Trajectory:
-    """Return the poses of the frames whose place in the map is known."""
-    poses = slam.poses.trajectory()
-    is_known = torch.tensor([status.is_localised for status in slam.poses.statuses], dtype=torch.bool)
-    return Trajectory(poses.stamps[is_known], poses.T_wc[is_known])

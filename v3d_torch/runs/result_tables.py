@@ -99,8 +99,9 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
     evaluation, evaluation_error = None, None
     if groundtruth is not None and slam.poses.was_found:
         try:
-            is_localised = torch.tensor([status.is_localised for status in slam.poses.statuses])
-            evaluation = evaluate(groundtruth, trajectory, frames=pipeline.frame_count, is_localised=is_localised)
+            evaluation = evaluate(
+                groundtruth, trajectory, frames=pipeline.frame_count, is_localised=slam.poses.localised
+            )
         except InputError as error:
             evaluation_error = str(error)
     return ResultTables(

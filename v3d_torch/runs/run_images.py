@@ -85,8 +85,7 @@ class LocalisedFrames:
 
     def every(self, step: int) -> LocalisedFrames:
         """Return every n-th frame."""
-        poses = Trajectory(self.poses.stamps[::step], self.poses.T_wc[::step])
-        return LocalisedFrames(self.indices[::step], poses)
+        return LocalisedFrames(self.indices[::step], self.poses.select(slice(None, None, step)))
 
 
 def localised_frames(run: StoredRun, *, only_keyframes: bool = False) -> LocalisedFrames:
@@ -108,8 +107,7 @@ def localised_frames(run: StoredRun, *, only_keyframes: bool = False) -> Localis
         rows = [position for position in rows if table[position]["keyframe"]]
     if not rows:  # a run with --localise makes no keyframes
         raise InputError(f"{run.folder}: has no keyframe with a known pose; export without --keyframes")
-    poses = Trajectory(run.trajectory.stamps[rows], run.trajectory.T_wc[rows])
-    return LocalisedFrames([table[position]["frame"] for position in rows], poses)
+    return LocalisedFrames([table[position]["frame"] for position in rows], run.trajectory.select(rows))
 
 
 def posed_images(

@@ -77,7 +77,7 @@ def read_run(folder: Path, groundtruth: Path | None = None) -> StoredRun:
     frames = len(metrics.status)
     if trajectory is not None and metrics.failure is not None:
         # If the run was killed after it wrote the trajectory and before metrics.json, the trajectory has more poses.
-        trajectory = Trajectory(trajectory.stamps[:frames], trajectory.T_wc[:frames])
+        trajectory = trajectory.select(slice(frames))
     if trajectory is not None and len(trajectory) != frames:
         raise InputError(
             f"{folder}: trajectory.txt has {len(trajectory)} poses and metrics.json {frames} frames, so they belong to"

@@ -51,6 +51,11 @@ class PoseHistory(StatefulComponent):
         return [self._current_status(code, keyframe) for code, keyframe in rows]
 
     @property
+    def localised(self) -> Tensor:
+        """Mask of the frames with `TrackingStatus.is_localised`, bool, shape :math:`(N,)`."""
+        return torch.tensor([status.is_localised for status in self.statuses], dtype=torch.bool)
+
+    @property
     def status(self) -> TrackingStatus | None:
         """Status of the last frame as it is known now; None before the first."""
         if not len(self):

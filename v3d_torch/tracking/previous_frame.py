@@ -51,11 +51,8 @@ class PreviousFrameRefinement:
         """
         if previous is None or previous.landmarks is None or velocity is None or not self._map.keyframes:
             return
-        keyframe, depth, delay = (
-            self._map.newest_keyframe_at(previous.frame.stamp),
-            previous.depth,
-            previous.frame.depth_delay,
-        )
+        keyframe = self._map.newest_keyframe_at(previous.frame.stamp)
+        depth, delay = previous.depth, previous.frame.depth_delay
         if keyframe is not None:
             features = compensate(keyframe.features, depth, delay, velocity, self._map.readout)
             had_velocity = poses.is_motion_measured or not self._refine_pose

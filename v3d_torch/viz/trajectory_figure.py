@@ -117,7 +117,7 @@ def within(groundtruth: Trajectory, estimate: Trajectory) -> Trajectory:
     """Return the part of a ground truth during an estimate: recordings of ground truth are often longer."""
     first, last = estimate.stamps[0] - MAX_TIME_DIFFERENCE, estimate.stamps[-1] + MAX_TIME_DIFFERENCE
     rows = (groundtruth.stamps >= first) & (groundtruth.stamps <= last)
-    return Trajectory(groundtruth.stamps[rows], groundtruth.T_wc[rows])
+    return groundtruth.select(rows)
 
 
 def _separate_guesses(points: Tensor, statuses: Sequence[str]) -> tuple[Tensor, Tensor]:

@@ -128,9 +128,8 @@ class RunMessages:
             newest = self._last[-1] if self._last else len(slam.poses) - 1
             T_ml = frames.camera_in_map(invert(slam.poses.poses_of([newest])[0]), T_mw)
             self._odometry_frame.turn_map(T_ml)
-            status = slam.poses.status
-            is_localised, is_lost = status is not TrackingStatus.DISCONNECTED, status is TrackingStatus.LOST
-            yield "/tf", self._tree(self.stamp, is_localised=is_localised, is_lost=is_lost)
+            is_lost = slam.poses.status is TrackingStatus.LOST
+            yield "/tf", self._tree(self.stamp, is_localised=is_lost or slam.poses.is_localised, is_lost=is_lost)
         yield (
             "/path",
             path(self.stamp, frames.MAP, trajectory.stamps.tolist(), frames.camera_in_map(trajectory.T_wc, T_mw)),

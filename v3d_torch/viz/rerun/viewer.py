@@ -203,9 +203,8 @@ class RerunViewer:
         summary = rr.TextDocument(f"{heading}\n\n{format_objects(objects)}", media_type="text/markdown")
         self._stream.log("frame_summary", summary)
         events = [status.value] if status is not TrackingStatus.TRACKED else []
-        events += (
-            [f"keyframe {len(slam.map.keyframes) - 1}"] if slam.map.newest_keyframe_at(frame.stamp) is not None else []
-        )
+        if slam.map.newest_keyframe_at(frame.stamp) is not None:
+            events.append(f"keyframe {len(slam.map.keyframes) - 1}")
         if slam.loop_closer.loop_count > self._loops:
             self._loops = slam.loop_closer.loop_count
             events.append("loop closed, map corrected")
