@@ -27,8 +27,8 @@ from v3d_torch.geometry.depth_units import depth_to_metres
 from v3d_torch.geometry.se3 import interpolate
 
 MIN_INTERVAL = 0.01
-"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Closer stamps
-come from a computer that received two frames at once; the true interval was longer."""
+"""Minimum time between two frames, seconds: RGB-D cameras send at most 90 frames per second. Closer stamps come from
+a computer that received two frames at once; the true interval was longer."""
 
 _MAX_STAMP = 1e11
 """Maximum stamp of a frame, seconds, three thousand years: a larger one is in milliseconds or nanoseconds."""

@@ -23,10 +23,10 @@ _MAX_VARIANCE = 1.0
 """Maximum variance of a coordinate, square metres: people who are out of view for seconds mostly stay in the room."""
 
 _COVERAGE_WEIGHT = 3.0
-"""Evidence of a mask that covers the predicted mask completely; its negative if the masks do not overlap."""
+"""Log ratio of a mask that covers the predicted mask completely; its negative if the masks do not overlap."""
 
 _OVERLAP_WEIGHT = 2.0
-"""Evidence of equal masks, in addition to coverage."""
+"""Log ratio of equal masks, in addition to coverage."""
 
 _OTHER_DISSIMILARITY = 0.21
 """Mean dissimilarity (1 - similarity) of the histograms of two people."""
@@ -50,10 +50,10 @@ _MIN_APPEARANCE = -3.0
 """Lower bound of the log ratio of appearances: some masks cover a part of another person."""
 
 _CLASS_CHANGE = -2.0
-"""Evidence of a different class; it is small, because the class of an object can change between frames."""
+"""Log ratio of a different class; it is small, because the class of an object can change between frames."""
 
 _VACATED_RATE, _MAX_VACATED = 30.0, 6.0
-"""Evidence against a track per second for which its predicted place was observed to be empty, and its upper bound."""
+"""Decrease of the log ratio per second for which the predicted place was observed to be empty, and its maximum."""
 
 _RADIUS = 0.3
 """Horizontal radius of a person, metres."""
