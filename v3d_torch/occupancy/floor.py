@@ -14,10 +14,10 @@ from v3d_torch.objects.dbscan import dbscan
 from v3d_torch.occupancy.occupancy_map import OccupancyMap, VoxelState
 from v3d_torch.occupancy.up_direction import UpDirection
 
-_MAX_VOXELS = 8192
+_MAX_VOXELS = 4096
 """Maximum number of voxels that are used, to bound the time; a larger number is subsampled."""
 
-_MAX_CANDIDATES = 1024
+_MAX_CANDIDATES = 256
 """Maximum number of normals that are tested as up direction; a larger number is subsampled."""
 
 _NORMAL_RADIUS = 2

@@ -107,7 +107,7 @@ class OccupancyMapper(StatefulComponent):
     def find_floor(self) -> Floor | None:
         """Find the floor of the map as it is now; None if none is visible.
 
-        It takes 0.1 s in a room, and half a second in a map of 30 m.
+        It takes 0.1 s in a room, and 0.2 s in a map of 30 m.
         """
         return find_floor(self.map, self.up)
 
