@@ -260,10 +260,11 @@ def test_frames_of_a_disconnected_keyframe_are_disconnected() -> None:
     camera.append(0.0, frame_pose(EYE, TrackingStatus.LOST), keyframe(), new=guess)
     camera.append(0.1, frame_pose(EYE), guess)
     camera.append(0.2, frame_pose(EYE, TrackingStatus.ODOMETRY), guess)
-    assert camera.poses.statuses == [TrackingStatus.DISCONNECTED, TrackingStatus.DISCONNECTED, TrackingStatus.ODOMETRY]
+    assert camera.poses.statuses == 3 * [TrackingStatus.DISCONNECTED]
+    assert not camera.poses.is_localised and not camera.poses.localised.any()
 
 
-def test_frames_of_a_part_that_a_loop_joins_with_the_rest_are_tracked() -> None:
+def test_frames_of_a_part_that_a_loop_joins_with_the_rest_have_the_status_of_their_pose() -> None:
     camera = begin_lost(2)
     guess, other = keyframe(part=1), keyframe(part=2)
     camera.append(0.2, frame_pose(EYE, LOST), keyframe(), STEP, guess)
@@ -271,7 +272,8 @@ def test_frames_of_a_part_that_a_loop_joins_with_the_rest_are_tracked() -> None:
     camera.append(0.4, frame_pose(EYE), guess, STEP)
     assert camera.poses.statuses == 5 * [TrackingStatus.DISCONNECTED]
     guess.part = 0
-    assert camera.poses.statuses == [*3 * [TRACKED], TrackingStatus.DISCONNECTED, TRACKED]
+    odometry = TrackingStatus.ODOMETRY  # the lost frames before the part, which measured motions link to it
+    assert camera.poses.statuses == [odometry, odometry, TRACKED, TrackingStatus.DISCONNECTED, TRACKED]
     assert camera.poses.status is TRACKED
 
 

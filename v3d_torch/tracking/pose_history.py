@@ -30,7 +30,7 @@ class PoseHistory(StatefulComponent):
     def __init__(self) -> None:
         self._frames = TensorTable(
             stamp=((), torch.float64),
-            status=((), torch.int64),  # position in TrackingStatus, as it was known when the row was made
+            status=((), torch.int64),  # position in TrackingStatus; never DISCONNECTED, which depends on the keyframe
             keyframe=((), torch.int64),  # index of the keyframe; -1 for the world frame, before the first keyframe
             T_ck=((4, 4), torch.float64),  # motion from the keyframe to the camera
             is_motion_measured=((), torch.bool),  # true if the motion since the previous frame was measured
@@ -80,8 +80,7 @@ class PoseHistory(StatefulComponent):
     @property
     def is_localised(self) -> bool:
         """True if the pose of the last frame is known relative to the whole map; False before the first."""
-        status, keyframe = self.status, self.keyframe
-        return status is not None and status.is_localised and not (keyframe is not None and keyframe.is_disconnected)
+        return self.status is not None and self.status.is_localised
 
     @property
     def part(self) -> int:
@@ -119,7 +118,8 @@ class PoseHistory(StatefulComponent):
             of the map, float64, shape :math:`(4, 4)`; else None.
         """
         keyframe = reference if new is None else new
-        status, is_found = _status(pose, keyframe, is_new=new is not None), pose.status is not TrackingStatus.LOST
+        is_found = pose.status is not TrackingStatus.LOST
+        status = TrackingStatus.TRACKED if new is not None and not is_found else pose.status  # it starts a part
         T_new_old = None
         if self.status is TrackingStatus.LOST and status is not TrackingStatus.LOST:
             correction = torch.eye(4, dtype=torch.float64)  # a new part of the map starts at the predicted pose
@@ -171,8 +171,6 @@ class PoseHistory(StatefulComponent):
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""
-        disconnected = keyframe is not None and keyframe.is_disconnected
-        found = TrackingStatus.DISCONNECTED if disconnected else TrackingStatus.ODOMETRY
         frames = self._frames
         for row in reversed(range(len(frames))):
             if _STATUSES[int(frames["status"][row])] is not TrackingStatus.LOST or not (linked or move_all):
@@ -180,7 +178,7 @@ class PoseHistory(StatefulComponent):
             frames["T_ck"][row] = _relative(self._pose_of(row) @ invert(T_new_old), keyframe)
             frames["keyframe"][row] = self._add_keyframe(keyframe)
             if linked:
-                frames["status"][row] = _STATUSES.index(found)
+                frames["status"][row] = _STATUSES.index(TrackingStatus.ODOMETRY)
             linked = linked and bool(frames["is_motion_measured"][row])
 
     def _add_keyframe(self, keyframe: Keyframe | None) -> int:
@@ -197,8 +195,8 @@ class PoseHistory(StatefulComponent):
     def _current_status(self, code: int, keyframe: int) -> TrackingStatus:
         """Return the status of a row: a loop can have joined the part of the map of its keyframe with the rest."""
         status, reference = _STATUSES[code], self._keyframes.get(keyframe)
-        is_joined = reference is not None and not reference.is_disconnected
-        return TrackingStatus.TRACKED if status is TrackingStatus.DISCONNECTED and is_joined else status
+        is_guess = status.is_localised and reference is not None and reference.is_disconnected
+        return TrackingStatus.DISCONNECTED if is_guess else status
 
     def _pose_of(self, row: int) -> Tensor:
         """Return the world-to-camera pose of a frame in the current map, float64, shape (4, 4)."""
@@ -209,15 +207,6 @@ class PoseHistory(StatefulComponent):
         T_kw = torch.eye(4, dtype=torch.float64).repeat(max(self._keyframes, default=-1) + 2, 1, 1)
         T_kw[list(self._keyframes)] = stack_poses(list(self._keyframes.values()))
         return T_kw
-
-
-def _status(pose: FramePose, keyframe: Keyframe | None, *, is_new: bool) -> TrackingStatus:
-    """Return the status of a frame, given its reference keyframe, or the new keyframe created from it."""
-    is_in_map = is_new or pose.status is TrackingStatus.TRACKED
-    if is_in_map and keyframe is not None and keyframe.is_disconnected:
-        return TrackingStatus.DISCONNECTED
-    starts_map = is_new and pose.status is TrackingStatus.LOST
-    return TrackingStatus.TRACKED if starts_map else pose.status
 
 
 def _pose(keyframe: Keyframe | None) -> Tensor:
