@@ -107,8 +107,8 @@ class V3DSLAM(FramePreprocessor):
 
     Raises:
         WeightsError: If the weights of the network are not available.
-        ConfigError: If a parameter has the wrong type, the known map is of another camera, or a stage that the
-            configuration names by its import path cannot be made, see `StagesConfig`.
+        ConfigError: If a parameter has the wrong type, the known map is of another camera or configuration, or a stage
+            that the configuration names by its import path cannot be made, see `StagesConfig`.
         InputError: If the lens model of the camera maps no ray in front of the camera to some pixels.
     """
 
@@ -125,6 +125,11 @@ class V3DSLAM(FramePreprocessor):
         if known_map is not None and known_map.camera != camera:
             raise ConfigError("the known map was loaded for another camera; load it with the camera of the frames")
         config = self.config
+        if known_map is not None and (known_map.config, known_map.features_config) != (config.mapping, config.features):
+            raise ConfigError(
+                "the known map was loaded with other values in the sections mapping or features; load it with the"
+                " configuration of the system"
+            )
         self.timer = StageTimer()
         self.map = SparseMap.empty(config, camera) if known_map is None else known_map
         self.poses = PoseHistory()
@@ -262,7 +267,8 @@ class V3DSLAM(FramePreprocessor):
             features = self._compensate(preprocessed.extraction.features, preprocessed, velocity)
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
-        delay = frame.depth_delay + self.camera.depth_delay
+        is_delayed = self.config.rolling_shutter.enabled  # else colour and depth count as simultaneous
+        delay = is_delayed * (frame.depth_delay + self.camera.depth_delay)
         T_dc = se3_exp(motion.velocity * delay)  # from the time of the colour image to that of the depth image
         objects, view = self._track_objects(preprocessed, features, motion, T_dc)  # III-A to III-D
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe

@@ -269,6 +269,10 @@ class TrackingStatus(StrEnum):
         return self in (TrackingStatus.TRACKED, TrackingStatus.ODOMETRY)
 
 
+TRACKING_STATUSES = tuple(TrackingStatus)
+"""All statuses; tables contain the position of a status in this tuple."""
+
+
 class LandmarkObserver:
     """Base class of data with the landmark id of each feature of an image.
 

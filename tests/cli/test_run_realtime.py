@@ -24,6 +24,7 @@ from v3d_torch.cli import run
 from v3d_torch.datasets.demo.sequence import FRAME_RATE
 from v3d_torch.datasets.tum_trajectory import read_trajectory
 from v3d_torch.datasets.tum_writer import TUMWriter
+from v3d_torch.io.files import write_png
 
 pytestmark = pytest.mark.usefixtures("no_figures")
 
@@ -172,3 +173,27 @@ def test_camera_is_tracked_again_within_a_second_after_the_process_was_stopped_f
 def test_options_that_exclude_each_other_are_an_error(sequence: Path, tmp_path: Path, option: str, words: str) -> None:
     done = call("--seq", sequence, "--segmenter", "none", "--realtime", option, "--out", tmp_path / "out")
     assert_error_line(done, words)
+
+
+def test_masks_are_checked_as_for_a_stored_run(tmp_path: Path) -> None:
+    """Each frame got the mask of the frame with half its number."""
+    folder = write_walker(tmp_path / "walker", 8)
+    images = sorted((folder / "ids").iterdir())
+    for number, image in enumerate([*images, *images]):
+        (tmp_path / "ids").mkdir(exist_ok=True)
+        shutil.copy(image, tmp_path / "ids" / f"{number:04}.png")
+    for options in ([], ["--realtime"]):
+        done = call("--seq", folder, "--segmenter", "masks", "--masks", tmp_path / "ids", *options)
+        assert_error_line(
+            done, f"{tmp_path / 'ids'}: has 16 id images for 8 frames, and their names are not timestamps"
+        )
+
+
+def test_cause_of_a_lost_camera_is_found_in_the_images(moment: Path, tmp_path: Path) -> None:
+    without_depth = tmp_path / "empty"
+    shutil.copytree(moment, without_depth)
+    for path in (without_depth / "depth").iterdir():
+        write_png(path, np.zeros((480, 640), np.uint16))
+    done = call("--seq", without_depth, "--segmenter", "none", "--realtime", "--out", tmp_path / "out")
+    assert_error_line(done, "empty: the camera was not found in any of the ")
+    assert "frames, the depth images are empty; record or export them again" in " ".join(done.stderr.split())

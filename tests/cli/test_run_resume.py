@@ -39,6 +39,7 @@ from v3d_torch.runs.metrics_file import read_metrics
 from v3d_torch.runs.request import RunRequest, read_request
 from v3d_torch.runs.result_folder import lock_results
 from v3d_torch.runs.run_summary import way_to_resume
+from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.runs.stored_run import read_run
 
 pytestmark = pytest.mark.usefixtures("no_figures")
@@ -712,7 +713,8 @@ def test_live_stream_cannot_be_resumed(sequence: Path, tmp_path: Path) -> None:
 
     pipeline = Pipeline(Live(), V3DSLAM(frames.camera, NoSegmentation()))  # type: ignore[arg-type]
     assert pipeline().failure is None
-    write_checkpoint(tmp_path, pipeline, RunRequest("realsense:", Config()), FileSizes(pipeline.sequence))
+    files = SegmentationFiles(None, NoSegmentation(), pipeline.sequence)
+    write_checkpoint(tmp_path, pipeline, RunRequest("realsense:", Config()), FileSizes(pipeline.sequence), files)
     assert_error_line(
         call("--resume", tmp_path),
         f"{tmp_path}: the run of a live stream (realsense:) cannot be resumed; its results so far are in",

@@ -8,7 +8,7 @@ import pytest
 
 import v3d_torch
 from v3d_torch.config import Config
-from v3d_torch.config.loading import CONFIGS, dump_config, find_config, load_config
+from v3d_torch.config.loading import CONFIGS, dump_config, find_config, load_config, override_config
 from v3d_torch.errors import ConfigError
 
 
@@ -150,3 +150,9 @@ def test_error_names_the_source_of_the_value(tmp_path: Path) -> None:
     file.write_text("seed: -1\n")
     with pytest.raises(ConfigError, match=r"good\.yaml: seed"):
         load_config(file, ["threads=2"])
+
+
+def test_errors_name_the_option_that_sets_a_value() -> None:
+    for override in ("seed=010", "seed", "seed.x=1", "seed=[", "seed=-1"):
+        with pytest.raises(ConfigError, match=r"^--seed"):
+            override_config(Config(), [override], source="--seed")

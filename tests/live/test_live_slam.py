@@ -126,7 +126,7 @@ def test_frames_that_come_while_one_is_processed_are_left_out_but_the_newest() -
     assert live.dropped == FRAMES - len(indices) == sum(result.dropped for result in results)
 
 
-def test_stages_are_called_before_the_camera_starts() -> None:
+def test_stages_of_the_package_are_called_before_the_camera_starts() -> None:
     """The first call of colour histograms builds the tables of the colour space: it needs an object to do so."""
     events: list[object] = []
 
@@ -139,7 +139,7 @@ def test_stages_are_called_before_the_camera_starts() -> None:
         yield Wall()[0]
 
     slam = V3DSLAM(CAMERA, square)
-    slam.describe_appearance = describe
+    vars(slam)["describe_appearance"] = describe  # as if it were the package's own
     assert len(list(LiveSLAM(source(), slam))) == 1
     assert events[:2] == [1, "camera starts"]
 
@@ -369,3 +369,29 @@ def test_second_loop_beside_the_first_is_rejected() -> None:
 def test_configuration_without_threads_is_rejected() -> None:
     with pytest.raises(ConfigError, match="prefetch=false: a live camera needs threads; remove --serial"):
         LiveSLAM(iter(()), V3DSLAM(CAMERA, square, Config(prefetch=False)))
+
+
+def test_hooks_and_stages_of_users_see_frames_of_the_camera_only() -> None:
+    """Libraries are warmed up with an empty image, which is none of the camera's."""
+    means: list[tuple[str, float]] = []
+
+    class Detector:
+        def __init__(self, detect: Any) -> None:
+            self._detect = detect
+
+        def __call__(self, image: Tensor, depth: Tensor) -> Any:
+            means.append(("stage", float(image.float().mean())))
+            return self._detect(image, depth)
+
+    def record(name: str, arguments: tuple[Any, ...], result: object) -> None:
+        means.append((name, float(arguments[0].float().mean())))
+
+    slam = V3DSLAM(CAMERA, square)
+    slam.detect_features = Detector(slam.detect_features)
+    for name in ("detect_features", "describe_appearance"):
+        slam.register_stage_hook(name, record)
+    source, send = feed()
+    for _ in LiveSLAM(source, slam):
+        send()
+    assert [name for name, _ in means].count("stage") == [name for name, _ in means].count("detect_features") == FRAMES
+    assert all(mean > 0 for _, mean in means)

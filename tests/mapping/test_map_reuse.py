@@ -13,6 +13,7 @@ from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.config.loading import load_config
+from v3d_torch.errors import ConfigError
 from v3d_torch.geometry.se3 import invert, se3_log
 from v3d_torch.mapping.map_io import StoredMap, load_map, save_map
 from v3d_torch.odometry.rolling_shutter import Readout
@@ -174,3 +175,12 @@ def test_segmenter_gets_no_pose_before_relocalisation(wall: tuple[Path, Pipeline
     # The next frames are preprocessed before this frame is tracked.
     unknown = found + 1 + PREFETCHED_FRAMES
     assert has_pose == unknown * [False] + (len(has_pose) - unknown) * [True] and has_pose[-1]
+
+
+def test_map_that_was_loaded_with_another_configuration_is_rejected(wall: tuple[Path, Pipeline]) -> None:
+    """The system changed a map that it only localises in."""
+    known = load_map(wall[0], CAMERA, CONFIG).map
+    with pytest.raises(
+        ConfigError, match=r"^the known map was loaded with other values in the sections mapping or"
+    ):
+        V3DSLAM(CAMERA, NoSegmentation(), LOCALISE, known)

@@ -30,6 +30,7 @@ from v3d_torch.mapping.static_views import StaticViews
 from v3d_torch.objects.frame_objects import FrameObjects, MotionState, TrackedObject
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.pipeline.run_record import Snapshot
+from v3d_torch.reconstruction.point_map import PointMap
 from v3d_torch.runs.results import write_results
 from v3d_torch.segmentation.coco import PERSON
 from v3d_torch.slam import V3DSLAM
@@ -345,3 +346,20 @@ def test_part_of_the_map_whose_place_is_a_guess_is_uncertain_and_not_in_the_poin
     (warning,) = [each for each in pipeline.record.warnings if "only a guess" in each]
     count = pipeline.slam.poses.statuses.count(TrackingStatus.DISCONNECTED)
     assert count >= len(disconnected) and warning.startswith(f"{count} of {len(results)} frames")
+
+
+def test_time_of_the_viewer_belongs_to_the_frame_that_it_shows() -> None:
+    """It was that of the next frame, and that of the last frame was lost."""
+
+    class SlowViewer:
+        def show(self, frame: RGBDFrame, objects: FrameObjects, slam: V3DSLAM, stage_times: object) -> None:
+            with slam.timer("viewer"):
+                time.sleep(0.05 * (frame.index in (1, FRAMES - 1)))
+
+        def finish(self, slam: V3DSLAM, point_map: PointMap) -> None:
+            pass
+
+    pipeline = Pipeline(Wall(), V3DSLAM(CAMERA, square), viewer=SlowViewer())
+    times = pipeline().times
+    slow = times.wall[:, times.stages.index("viewer")] > 0.04
+    assert torch.nonzero(slow)[:, 0].tolist() == [1, FRAMES - 1]

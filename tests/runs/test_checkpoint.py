@@ -18,6 +18,7 @@ from v3d_torch.runs.autosave import Autosave
 from v3d_torch.runs.checkpoint import FileSizes, describe_change, read_checkpoint, write_checkpoint
 from v3d_torch.runs.request import RunRequest
 from v3d_torch.runs.run import Run
+from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.segmentation import UprightSegmenter
 from v3d_torch.segmentation.coco import PERSON, UNLABELLED
 from v3d_torch.segmentation.segmenter import segmenter_state_of
@@ -62,7 +63,8 @@ def test_run_resumed_many_times_equals_an_uninterrupted_run(uninterrupted: Pipel
         record = pipeline(interrupt_after(stop))
         assert record.failure == f"interrupted after {stop + 1} of {len(Walk())} frames"
         assert pipeline.between_frames
-        write_checkpoint(tmp_path, pipeline, request, FileSizes(pipeline.sequence))
+        files = SegmentationFiles(None, pipeline.slam.segment, pipeline.sequence)
+        write_checkpoint(tmp_path, pipeline, request, FileSizes(pipeline.sequence), files)
         checkpoint = read_checkpoint(tmp_path)
         assert (checkpoint.frames, checkpoint.request.config) == (stop + 1, pipeline.slam.config)
         assert checkpoint.request == request.absolute() and checkpoint.request.save_masks

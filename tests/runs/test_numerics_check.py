@@ -94,7 +94,8 @@ def test_all_stages_are_checked(demo: RGBDSequence) -> None:
     plain = V3DSLAM(demo.camera, config=NO_NETWORK)
     callables = {name for name, value in vars(plain).items() if callable(value) and not name.startswith("_")}
     stages = {name for name, value in vars(slam).items() if isinstance(value, CheckedStage)}
-    assert stages == callables - {"timer"} | {"loop_closer", "back_end"}  # these two are used by their methods
+    by_methods = {"loop_closer", "back_end", "motion_model"}  # these are used by their methods
+    assert stages == callables - {"timer"} | by_methods
     assert {"segment", "smooth_depth", "odometry", "classify_motion", "track_camera", "mapper"} <= stages
 
 
@@ -287,3 +288,12 @@ def test_run_with_check_ends_at_nan_and_keeps_the_frames_before(demo: RGBDSequen
     run(lambda *_: None)
     assert run.pipeline.record.failure == "frame 2: segment.boxes is NaN: 4 of 4 numbers, the first at [0, 0]"
     assert len(read_trajectory(tmp_path / "trajectory.txt")) == 2
+
+
+def test_nan_of_the_motion_model_is_attributed_to_it(demo: RGBDSequence) -> None:
+    slam = CheckedSLAM(demo.camera, config=NO_NETWORK)
+    for index in range(2):
+        slam(demo[index])
+    slam.motion_model.velocity = torch.full((6,), math.nan, dtype=torch.float64)
+    with pytest.raises(NumericsError, match=r"motion_model\.predict\.velocity is NaN"):
+        slam(demo[2])

@@ -20,6 +20,7 @@ from v3d_torch.objects.feature_shift import FeatureShift
 from v3d_torch.runs.checkpoint import FileSizes, write_checkpoint
 from v3d_torch.runs.file_names import RunFile
 from v3d_torch.runs.request import RunRequest
+from v3d_torch.runs.segmentation_files import SegmentationFiles
 from v3d_torch.segmentation import NoSegmentation, UprightSegmenter
 from v3d_torch.segmentation.segmenter import segmenter_state_of
 from v3d_torch.types import Instances, RGBDFrame
@@ -113,7 +114,8 @@ def test_system_with_a_replaced_stage_without_state_is_not_saved(stage: str, tmp
 def test_checkpoint_is_not_loaded_as_the_state_of_a_system(tmp_path: Path) -> None:
     pipeline = make_pipeline(prefetch=False)
     pipeline(interrupt_after(1))
-    write_checkpoint(tmp_path, pipeline, RunRequest("walk", CONFIG), FileSizes(pipeline.sequence))
+    files = SegmentationFiles(None, pipeline.slam.segment, pipeline.sequence)
+    write_checkpoint(tmp_path, pipeline, RunRequest("walk", CONFIG), FileSizes(pipeline.sequence), files)
     with pytest.raises(InputError, match=rf"{RunFile.CHECKPOINT}: is "):
         load_state(tmp_path / RunFile.CHECKPOINT)
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from v3d_torch.backend.loop_closer import LoopCloser, LoopCorrection
@@ -23,6 +22,7 @@ from v3d_torch.mapping.culling import cull_landmarks, cull_redundant_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.local_bundle_adjustment import LocalAdjustment, local_bundle_adjust
 from v3d_torch.mapping.sparse_map import SparseMap
+from v3d_torch.runtime.inference_mode import in_current_mode
 from v3d_torch.runtime.stage_timer import StageTime, StageTimer
 
 
@@ -68,7 +68,7 @@ class BackEnd:
     def submit(self, keyframe: Keyframe) -> None:
         """Start the optimisation for the newest keyframe; the map must not change until its result is applied."""
         self.keyframe = keyframe
-        optimise = partial(self._optimise, keyframe, inference=torch.is_inference_mode_enabled())
+        optimise = in_current_mode(partial(self._optimise, keyframe))
         self._get_result = optimise if self._executor is None else self._executor.submit(optimise).result
 
     def result(self) -> BackEndResult | None:
@@ -125,13 +125,12 @@ class BackEnd:
         if pending is not None:
             self.submit(pending)
 
-    def _optimise(self, keyframe: Keyframe, *, inference: bool) -> BackEndResult:
+    def _optimise(self, keyframe: Keyframe) -> BackEndResult:
         """Adjust the map around a keyframe and detect a loop; the map itself does not change."""
         timer = StageTimer()
-        with torch.inference_mode(inference):
-            with timer("bundle"):
-                adjustment = local_bundle_adjust(self._map, keyframe, self._config, self._camera)
-            with timer("loop"):
-                T_cw = self._map.T_cw if adjustment is None else adjustment.T_cw
-                loop_correction = self._loop_closer.detect_loop(keyframe, self._map, T_cw)
+        with timer("bundle"):
+            adjustment = local_bundle_adjust(self._map, keyframe, self._config, self._camera)
+        with timer("loop"):
+            T_cw = self._map.T_cw if adjustment is None else adjustment.T_cw
+            loop_correction = self._loop_closer.detect_loop(keyframe, self._map, T_cw)
         return BackEndResult(keyframe, adjustment, loop_correction, timer.times)

@@ -29,6 +29,7 @@ from v3d_torch.optim.robust_losses import huber
 from v3d_torch.runtime.batches import (
     check_finite_arguments,
     check_shapes,
+    fill_fixed,
     fill_indices,
     fill_weights,
     from_rows,
@@ -259,8 +260,7 @@ def _prepare(
     """Graph and initial poses in float64, with the batch dimensions of all inputs."""
     count, device = edges.shape[-2], T_wc.device
     identity = torch.eye(6, dtype=torch.float64, device=device)
-    if fixed is None:
-        fixed = torch.arange(T_wc.shape[-3], device=device) == 0
+    fixed = fill_fixed(fixed, T_wc)
     if information is None:
         information = identity.expand(count, 6, 6)
     weights = fill_weights(weights, mask_or_all(valid, edges[..., 0]))

@@ -14,7 +14,7 @@ from v3d_torch.batch.batch_folder import describe_contents
 from v3d_torch.config import Config
 from v3d_torch.config.loading import FULL, find_config, load_config, override_config
 from v3d_torch.datasets import RGBDSequence, RGBDStream
-from v3d_torch.datasets.realtime_playback import RealtimePlayback
+from v3d_torch.datasets.realtime_playback import RealtimePlayback, stored_source
 from v3d_torch.errors import ConfigError, InputError, LockedError, OutputError, RunError
 from v3d_torch.io.files import check_writable
 from v3d_torch.mapping.map_io import StoredMap, load_map
@@ -264,10 +264,11 @@ def _open_inputs(request: RunRequest, checkpoint: Checkpoint | None, console: Co
     if checkpoint is not None:
         _check_segmentation(checkpoint, SegmentationFiles(request.weights, segment, sequence))
     elif isinstance(segment, MaskFolder):
-        if isinstance(sequence, Sized):
-            segment.check_number(len(sequence))
-        if isinstance(sequence, RGBDSequence) and not request.skip_broken:  # a broken frame needs no id image
-            segment.check_stamps(sequence.stamps)
+        stored = stored_source(sequence)
+        if isinstance(stored, Sized):
+            segment.check_number(len(stored))
+        if isinstance(stored, RGBDSequence) and not request.skip_broken:  # a broken frame needs no id image
+            segment.check_stamps(stored.stamps)
     return _Inputs(sequence, segment, known_map)
 
 
@@ -277,7 +278,7 @@ def _check_segmentation(checkpoint: Checkpoint, files: SegmentationFiles) -> Non
     Raises:
         InputError: If a file has changed.
     """
-    if checkpoint.segmentation and (changed := files.changed_file(checkpoint.segmentation)) is not None:
+    if (changed := files.changed_file(checkpoint.segmentation)) is not None:
         raise InputError(
             f"{changed}: has changed since the run in {checkpoint.folder} began; restore it, or start a new run"
         )

@@ -88,7 +88,7 @@ def override_config(config: Config, overrides: Iterable[str], source: str = "--s
 
 def _apply_overrides(tree: dict[str, Any], config: Config, overrides: Iterable[str], source: str) -> Config:
     for override in [overrides] if isinstance(overrides, str) else overrides:  # a string is an iterable, too
-        _apply_override(tree, override)
+        _apply_override(tree, override, source)
         config = _validate(tree, source)
     return config
 
@@ -122,21 +122,21 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _apply_override(tree: dict[str, Any], override: str) -> None:
+def _apply_override(tree: dict[str, Any], override: str, source: str) -> None:
     key, separator, text = replace_odd_spaces(override).partition("=")
     if not separator or not key.strip():
-        raise ConfigError(f"--set {override!r}: write section.key=value, such as objects.voting.vote_threshold=2")
+        raise ConfigError(f"{source} {override!r}: write section.key=value, such as objects.voting.vote_threshold=2")
     *sections, leaf = key.strip().split(".")
     for section in sections:
         tree = tree.setdefault(section, {})
         if not isinstance(tree, dict):
-            raise ConfigError(f"--set {override!r}: {section!r} is a value and has no keys")
+            raise ConfigError(f"{source} {override!r}: {section!r} is a value and has no keys")
     if _LEADING_ZERO.fullmatch(text.strip()):
-        raise ConfigError(f"--set {override!r}: YAML reads a leading zero as octal; write {int(text)} instead")
+        raise ConfigError(f"{source} {override!r}: YAML reads a leading zero as octal; write {int(text)} instead")
     try:
         tree[leaf] = parse_yaml(text)
     except ValueError as error:
-        raise ConfigError(f"--set {override!r}: the value is not valid YAML ({error})") from error
+        raise ConfigError(f"{source} {override!r}: the value is not valid YAML ({error})") from error
 
 
 def _reject_extreme_numbers(section: Section, source: str, prefix: str = "") -> None:

@@ -320,7 +320,7 @@ class RollingShutterConfig(Section):
     """Compensation of the times at which rows of colour and depth are read while the camera moves."""
 
     enabled: bool = True
-    """False to treat all rows of both images as simultaneous."""
+    """False to treat all rows of both images as simultaneous: the rolling shutter and the depth delay are ignored."""
     readout: float = Field(0.02, ge=-0.05, le=0.05)
     """Initial value of the time from reading the first row to reading the last, seconds; it is then calibrated with the
     map. Not used if the camera file states the readout. The colour cameras of Kinect, Xtion, D415 and D435 have a
@@ -360,8 +360,8 @@ class MappingConfig(Section):
     redundant_views: int = Field(3, gt=0)
     """Number of other keyframes that must observe a landmark for it to be redundant (ORB-SLAM2)."""
     bundle_keyframes: int = Field(15, ge=0)
-    """Number of keyframes whose poses are adjusted in a local bundle adjustment, the same as in the local map; 0 turns
-    it off."""
+    """Number of keyframes around the newest one whose poses are adjusted in a local bundle adjustment, and which are
+    culled if they are redundant; the same as in the local map. 0 turns both off."""
 
 
 class LoopConfig(Section):

@@ -6,11 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from threading import Thread
 
-import torch
-
 from v3d_torch.frame_result import PreprocessedFrame, Segmentation
 from v3d_torch.live.frame_capture import CapturedFrame
 from v3d_torch.live.latest_queue import LatestQueue
+from v3d_torch.runtime.inference_mode import in_current_mode
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.types import RGBDFrame
 
@@ -54,9 +53,8 @@ class LivePreprocessor:
         self._prediction = slam.predictions[-1]
         self._last_tracked = 0  # number of the last frame whose tracking has begun
         self._last_segmented = -slam.config.segmentation.interval  # number of the last such frame that was segmented
-        self._inference = torch.is_inference_mode_enabled()
         self._segmenter = ThreadPoolExecutor(1, "segmentation")
-        self._thread = Thread(target=self._run, name="features", daemon=True)
+        self._thread = Thread(target=in_current_mode(self._run), name="features", daemon=True)
 
     def start(self) -> None:
         """Start the threads."""
@@ -81,9 +79,8 @@ class LivePreprocessor:
 
     def _run(self) -> None:
         try:
-            with torch.inference_mode(self._inference):
-                while (captured := self._captured.take()) is not None:
-                    self._preprocess(captured)
+            while (captured := self._captured.take()) is not None:
+                self._preprocess(captured)
         except BaseException as error:
             self.frames.close(error)
         else:
@@ -91,7 +88,7 @@ class LivePreprocessor:
 
     def _preprocess(self, captured: CapturedFrame) -> None:
         is_segmented = self._is_segmentation_due(captured.number)
-        segmentation = self._segmenter.submit(self._segment, captured.frame, is_segmented)
+        segmentation = self._segmenter.submit(in_current_mode(self._segment), captured.frame, is_segmented)
         extraction = self._slam.extract_features(captured.frame)
         preprocessed = PreprocessedFrame(captured.frame, extraction, segmentation.result)
         self.frames.put(LiveFrame(captured, preprocessed, is_segmented))
@@ -103,5 +100,4 @@ class LivePreprocessor:
         return since_segmented >= self._slam.config.segmentation.interval and not is_catching_up
 
     def _segment(self, frame: RGBDFrame, is_due: bool) -> Segmentation:
-        with torch.inference_mode(self._inference):
-            return self._slam.segment_instances(frame, self._prediction, is_due)
+        return self._slam.segment_instances(frame, self._prediction, is_due)

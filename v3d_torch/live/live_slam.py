@@ -18,6 +18,7 @@ from v3d_torch.objects.assignment import match_instances
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.clock import MONOTONIC_CLOCK, Clock
 from v3d_torch.runtime.process import trim_memory_at_intervals
+from v3d_torch.runtime.stage_hooks import without_hooks
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.camera_state import CameraState
 from v3d_torch.types import RGBDFrame
@@ -191,14 +192,21 @@ class LiveSLAM:
         self._measured_at = self._clock.now() if motion.is_measured else None
 
 
+@torch.no_grad()
 def _warm_up(slam: V3DSLAM) -> None:
-    """Call the stages without state once, on an empty image with one object.
+    """Call the package's own stages without state once, on an empty image with one object, and without their hooks.
 
     Libraries build tables and load modules at their first call, for a third of a second, in which ten frames would be
-    dropped.
+    dropped. Stages and hooks of users see frames of the camera only.
     """
     size = slam.camera.height, slam.camera.width
-    frame = RGBDFrame(0, 0.0, torch.zeros(3, *size, dtype=torch.uint8), torch.ones(1, *size))
-    slam.extract_features(frame)
-    slam.describe_appearance(frame.image, torch.ones(1, *size, dtype=torch.bool))
+    image, depth = torch.zeros(3, *size, dtype=torch.uint8), torch.ones(1, *size)
+    arguments = {
+        "smooth_depth": (depth[None],),
+        "detect_features": (image, depth),
+        "describe_appearance": (image, torch.ones(1, *size, dtype=torch.bool)),
+    }
+    for name, given in arguments.items():
+        if name not in slam.replaced_stages:
+            without_hooks(getattr(slam, name))(*given)
     match_instances(torch.ones(1, 1, 1))

@@ -30,6 +30,7 @@ from v3d_torch.runtime.batches import (
     check_camera_matrix,
     check_finite_arguments,
     check_shapes,
+    fill_fixed,
     fill_indices,
     fill_weights,
 )
@@ -251,8 +252,7 @@ def prepare_bundle(
     valid = finite if valid is None else finite & valid
     measured = prepare_measurements(uv, inverse_depth, pixel_sigma, inverse_depth_sigma, valid)
     target = whiten(measured, K.to(torch.float64))
-    if fixed is None:
-        fixed = torch.arange(T_cw.shape[-3], device=T_cw.device) == 0
+    fixed = fill_fixed(fixed, T_cw)
     pose = fill_indices("pose", pose, T_cw.shape[-3], valid)
     point = fill_indices("point", point, points.shape[-2], valid)
     each = (*batch, pose.shape[-1])  # observation

@@ -97,7 +97,7 @@ def find_landmarks_in_use(tables: MapTables, external_ids: Iterable[Tensor] = ()
 def compacted_ids(in_use: Tensor) -> Tensor:
     """Return the new id of each landmark if only those in use remain, int64, shape :math:`(L + 1,)`.
 
-    The last element is -1, so that the id of no landmark, -1, selects itself.
+    The last element is -1, so that indexing with -1, for no landmark, gives -1.
 
     Args:
         in_use: Mask of the landmarks, bool, shape :math:`(L,)`.

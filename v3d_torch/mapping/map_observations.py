@@ -65,8 +65,8 @@ def select_observations(tables: MapTables, window: Tensor, config: Config, *, wi
     by_window = usable & contains(window.numpy(), keyframe, len(tables.keyframes))
     is_observed = contains(landmark[by_window], landmark, count)
     usable = usable if with_neighbours else by_window
-    times = np.bincount(landmark[usable], minlength=count)
-    rows = torch.from_numpy(np.flatnonzero(usable & is_observed & (times > 1).take(landmark)))
+    observers = np.bincount(landmark[usable], minlength=count)
+    rows = torch.from_numpy(np.flatnonzero(usable & is_observed & (observers > 1).take(landmark)))
     keyframes, pose = unique_ids(table["keyframe"][rows], len(tables.keyframes))
     landmarks, point = unique_ids(table["landmark"][rows], count)
     names = ("uv", "inverse_depth", "octave", "sigma_ratio")

@@ -29,11 +29,16 @@ class SparseMap(MapTables):
         config: Creation of landmarks, and whether the map can change.
         features_config: Scale pyramid of the features.
         camera: Intrinsics, for the back-projection of features to landmarks.
+
+    Attributes:
+        config: Creation of landmarks, and whether the map can change.
+        features_config: Scale pyramid of the features.
+        camera: Intrinsics.
     """
 
     def __init__(self, config: MappingConfig, features_config: FeaturesConfig, camera: PinholeCamera) -> None:
         super().__init__()
-        self._config = config
+        self.config = config
         self.features_config = features_config
         self.camera = camera
 
@@ -66,7 +71,7 @@ class SparseMap(MapTables):
         """
         index = len(self.keyframes)
         landmarks = landmarks.clone()
-        new = select_new_landmarks(features, landmarks, self._config.landmarks_per_keyframe, self.features_config.cell)
+        new = select_new_landmarks(features, landmarks, self.config.landmarks_per_keyframe, self.features_config.cell)
         landmarks[new] = create_landmarks(self.landmarks, index, T_cw, features[new], self.camera, self.features_config)
         keyframe = Keyframe(index, frame, stamp, T_cw, features, torch.full_like(landmarks, -1))
         self.keyframes.append(keyframe)
@@ -82,7 +87,7 @@ class SparseMap(MapTables):
             found: Ids of the landmarks that the frame matched, int64, shape :math:`(F,)`.
             visible: Ids of the landmarks that the frame should have matched, int64, shape :math:`(V,)`.
         """
-        if self._config.enabled:
+        if self.config.enabled:
             self.landmarks["found"][found] += 1
             self.landmarks["visible"][visible] += 1
 

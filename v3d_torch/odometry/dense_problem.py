@@ -33,8 +33,8 @@ _MIN_BRIGHTNESS_SIGMA = 1e-3
 """Minimum standard deviation of brightness: a quarter of an 8-bit step."""
 
 _MIN_DEPTH = 0.1
-"""Smallest depth of a point that is compared, metres, below the range of any RGB-D camera. It keeps 1/z
-finite, as the smaller `v3d_torch.optim.reprojection.MIN_DEPTH` does; no camera measures depth between the two."""
+"""Smallest depth of a point that is compared, metres, which keeps 1/z finite. RGB-D cameras measure no depth below it;
+so the smaller limit of `v3d_torch.optim.reprojection` has the same effect."""
 
 _GRADIENT_NOISE = 0.3
 """Variance of the noise of brightness gradients, divided by the squared scale of the residuals. The Sobel gradient

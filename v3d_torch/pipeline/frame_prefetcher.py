@@ -8,11 +8,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, ParamSpec, TypeVar
-
-import torch
+from typing import NamedTuple
 
 from v3d_torch.frame_result import Extraction, PreprocessedFrame, Segmentation
+from v3d_torch.runtime.inference_mode import in_current_mode
 from v3d_torch.runtime.stage_timer import StageTime, StageTimer
 from v3d_torch.slam import V3DSLAM
 from v3d_torch.tracking.motion_model import PosePrediction
@@ -20,9 +19,6 @@ from v3d_torch.types import RGBDFrame
 
 PendingFrame = Callable[[], PreprocessedFrame | None]
 """Function that waits for a preprocessed frame; returns None after the last frame."""
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
 
 
 class _ReadFrame(NamedTuple):
@@ -76,21 +72,10 @@ class FramePrefetcher:
         """Start to read and preprocess the next frame."""
         if not self._ahead:
             return partial(self._preprocess, prediction)
-        frame = self._start(self._reader, self._read)
-        segmentation = self._start(self._segmenter, self._segment, frame, prediction)
-        return partial(_combine, frame, segmentation, self._start(self._reader, self._extract, frame))
-
-    def _start(
-        self, executor: ThreadPoolExecutor, step: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs
-    ) -> Future[_R]:
-        """Start a step in a thread, with the inference mode of this thread."""
-        inference = torch.is_inference_mode_enabled()
-
-        def run() -> _R:
-            with torch.inference_mode(inference):
-                return step(*args, **kwargs)
-
-        return executor.submit(run)
+        frame = self._reader.submit(in_current_mode(self._read))
+        segmentation = self._segmenter.submit(in_current_mode(self._segment), frame, prediction)
+        extraction = self._reader.submit(in_current_mode(self._extract), frame)
+        return partial(_combine, frame, segmentation, extraction)
 
     def _preprocess(self, prediction: PosePrediction | None) -> PreprocessedFrame | None:
         """Read and preprocess the next frame in this thread."""

@@ -64,7 +64,8 @@ class Pipeline:
 
     Attributes:
         record: Records of the run.
-        between_frames: False while a frame is processed, and if the processing of a frame failed.
+        between_frames: False while a frame is processed, and if the processing of a frame of a sequence failed. A live
+            stream cannot be resumed, so that it has no meaning there.
 
     Raises:
         ConfigError: If the sequence is live, and the configuration does not allow threads.
@@ -119,10 +120,9 @@ class Pipeline:
             tracked = self._track_frames() if self._live is None else self._track_live(self._live)
             with torch.inference_mode(), closing(tracked):
                 for frame, result in tracked:
-                    times = self.slam.timer.lap()
-                    record.times.append(frame, times)
                     self._record_frame(frame, result)
-                    self._viewer.show(frame, result, self.slam, times)
+                    self._viewer.show(frame, result, self.slam, self.slam.timer.lap_times)
+                    record.times.append(frame, self.slam.timer.lap())
                     record.seconds, self.between_frames = previous_seconds + self._stopwatch.seconds, True
                     if on_frame is not None:
                         on_frame(frame, result)
@@ -215,11 +215,13 @@ class Pipeline:
 
     def _track_live(self, live: LiveSLAM) -> Generator[tuple[RGBDFrame, FrameResult], None, None]:
         """Track the frames of a live stream, and yield each with its result."""
-        with closing(iter(live)) as results:
-            for result in results:
-                self.between_frames = False
-                self.record.rejected = live.rejected
-                yield result.frame, result
+        try:
+            with closing(iter(live)) as results:
+                for result in results:
+                    self.between_frames = False
+                    yield result.frame, result
+        finally:
+            self.record.rejected = live.rejected  # also if no frame was tracked after the last rejected one
 
     def _remaining_frames(self) -> Iterator[RGBDFrame]:
         """Iterate over the frames that are later than the last tracked one."""

@@ -19,11 +19,9 @@ from v3d_torch.pipeline.repeated_images import RepeatedImages
 from v3d_torch.runtime.stage_timer import StageTime
 from v3d_torch.runtime.tensor_table import TensorTable
 from v3d_torch.tracking.camera_state import CameraState
-from v3d_torch.types import RGBDFrame, TrackingStatus
+from v3d_torch.types import TRACKING_STATUSES, RGBDFrame, TrackingStatus
 
 _MOTION_STATES = tuple(MotionState)
-
-_STATUSES = tuple(TrackingStatus)
 
 
 @dataclass(frozen=True)
@@ -178,7 +176,7 @@ class StateTable(TensorTable):
         """Append the state at a frame."""
         self.append(
             stamp=torch.tensor([state.stamp], dtype=torch.float64),
-            status=torch.tensor([_STATUSES.index(state.status)]),
+            status=torch.tensor([TRACKING_STATUSES.index(state.status)]),
             T_wc=state.T_wc[None, :3],
             covariance=state.covariance[None].to(torch.float32),
             twist=state.twist[None].to(torch.float32),
@@ -187,7 +185,7 @@ class StateTable(TensorTable):
     @property
     def statuses(self) -> list[TrackingStatus]:
         """Status of each frame when it was tracked."""
-        return [_STATUSES[code] for code in self["status"].tolist()]
+        return [TRACKING_STATUSES[code] for code in self["status"].tolist()]
 
 
 class LiveTable(TensorTable):

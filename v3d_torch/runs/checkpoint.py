@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -62,7 +62,7 @@ class Checkpoint:
         sequence: Fingerprint of the processed part of the sequence, see `_fingerprint`.
         frames: Number of frames processed.
         state: State of the pipeline.
-        segmentation: Fingerprint of the files of the segmenter, see `SegmentationFiles`; empty if it is not known.
+        segmentation: Fingerprint of the files of the segmenter, see `SegmentationFiles`.
     """
 
     folder: Path
@@ -70,7 +70,7 @@ class Checkpoint:
     sequence: Mapping[str, Any]
     frames: int
     state: Mapping[str, Any]
-    segmentation: Mapping[str, Any] = field(default_factory=dict)
+    segmentation: Mapping[str, Any]
 
 
 class FileSizes:
@@ -94,11 +94,7 @@ class FileSizes:
 
 
 def write_checkpoint(
-    folder: Path,
-    pipeline: Pipeline,
-    request: RunRequest,
-    sizes: FileSizes,
-    segmentation: SegmentationFiles | None = None,
+    folder: Path, pipeline: Pipeline, request: RunRequest, sizes: FileSizes, segmentation: SegmentationFiles
 ) -> None:
     """Write the state of a run to its folder.
 
@@ -109,7 +105,7 @@ def write_checkpoint(
         pipeline: Pipeline between two frames, after at least one frame.
         request: Request of the run.
         sizes: Sizes of the image files of the sequence of the pipeline.
-        segmentation: Files of the segmenter of the pipeline; None if they are not compared when the run is resumed.
+        segmentation: Files of the segmenter of the pipeline.
 
     Raises:
         OutputError: If the file cannot be written; the previous checkpoint stays.
@@ -120,7 +116,7 @@ def write_checkpoint(
     if isinstance(sequence, RGBDSequence):
         done = int(pipeline.record.times.indices[-1]) + 1
         metadata |= {"sequence": _fingerprint(sequence, done, sizes), "frames": len(pipeline.slam.poses)}
-        metadata["segmentation"] = {} if segmentation is None else segmentation.fingerprint(done)
+        metadata["segmentation"] = segmentation.fingerprint(done)
         state = pipeline.state_dict()
     write_state(folder / RunFile.CHECKPOINT, metadata, state, _CLASSES)
 
@@ -161,8 +157,8 @@ def read_checkpoint(folder: Path) -> Checkpoint:
                 f"{folder}: the run of a live stream ({request.seq}) cannot be resumed; its results so far are in"
                 " trajectory.txt"
             )
-        segmentation = metadata.get("segmentation", {})  # earlier versions stored none
-        return Checkpoint(folder, request, metadata["sequence"], metadata["frames"], state, segmentation)
+        sequence, frames, segmentation = (metadata[name] for name in ("sequence", "frames", "segmentation"))
+        return Checkpoint(folder, request, sequence, frames, state, segmentation)
     except (ValidationError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: is not the checkpoint of a run; run the sequence again") from error
 

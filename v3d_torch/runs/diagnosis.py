@@ -78,7 +78,7 @@ def check_lost_frames(pipeline: Pipeline) -> list[str]:
 @torch.inference_mode()  # stages are called, in the mode in which they ran
 def _cause_of_loss(pipeline: Pipeline, indices: Tensor) -> str:
     """Return cause and fix of the loss of frames, given by their indices in the sequence, int64, (N,)."""
-    sequence, max_depth = pipeline.sequence, pipeline.slam.config.features.max_depth
+    sequence, max_depth = stored_source(pipeline.sequence), pipeline.slam.config.features.max_depth
     if isinstance(sequence, RGBDSequence):
         samples = np.linspace(0, len(indices) - 1, min(_SAMPLES, len(indices))).astype(int)
         frames = [sequence[int(indices[sample])] for sample in samples]

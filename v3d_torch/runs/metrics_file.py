@@ -18,7 +18,7 @@ _MAX_DEPTH = 3
 
 
 class Metrics(BaseModel):
-    """Content of ``metrics.json`` except the scores; field names are its keys."""
+    """Values of ``metrics.json`` that later commands read, without the scores; field names are its keys."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

@@ -25,8 +25,8 @@ from v3d_torch.stages.stage_checks import RESULTS
 from v3d_torch.tracking.motion_model import PosePrediction
 from v3d_torch.types import RGBDFrame
 
-_CHECKED = {"segment", *RESULTS, *INNER_STAGES} - {"motion_model"}
-"""Names of the stages whose results are checked. Motion model and map have other checks."""
+_CHECKED = {"segment", *RESULTS, *INNER_STAGES}
+"""Names of the stages whose results are checked. The map is checked after each frame."""
 
 MAY_BE_NAN = frozenset(
     {

@@ -18,6 +18,7 @@ from v3d_torch.config import Config, Section
 from v3d_torch.errors import InputError
 from v3d_torch.evaluation.evaluation import note_too_few_poses
 from v3d_torch.io.image_file import read_image
+from v3d_torch.io.timestamps import format_timestamp
 from v3d_torch.runs.file_names import MASKS, RunFile
 from v3d_torch.runs.stored_run import StoredRun
 from v3d_torch.runs.wall_time import describe_wall_time
@@ -135,7 +136,8 @@ def _tracking_plots(run: StoredRun) -> dict[str, str]:
         return {}
     keyframes = run.keyframes.stamps if run.keyframes is not None else torch.zeros(0, dtype=torch.float64)
     plots = {"statuses": embed_svg(draw_statuses(run.trajectory.stamps, run.metrics.status, keyframes), "statuses")}
-    masks = [(stamp, run.folder / MASKS / f"{stamp:.6f}.png") for stamp in run.trajectory.stamps.tolist()]
+    folder = run.folder / MASKS
+    masks = [(stamp, folder / f"{format_timestamp(stamp)}.png") for stamp in run.trajectory.stamps.tolist()]
     saved = [(stamp, path) for stamp, path in masks if path.is_file()]
     if saved:
         fractions = torch.tensor([_masked_fraction(path) for _, path in saved], dtype=torch.float64)

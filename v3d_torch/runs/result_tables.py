@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pyarrow as pa
 import torch
+from torch import Tensor
 
 from v3d_torch.config.loading import dump_config
 from v3d_torch.datasets.tum_trajectory import write_trajectory
@@ -111,23 +112,27 @@ def collect_tables(pipeline: Pipeline) -> ResultTables:
         evaluation=evaluation,
         evaluation_error=evaluation_error,
         config=dump_config(slam.config),
-        frames=_frame_table(pipeline),
+        frames=_frame_table(pipeline, stamps),
         states=make_state_table(pipeline.record),
         objects=_object_table(pipeline.record.objects),
     )
 
 
-def _frame_table(pipeline: Pipeline) -> pa.Table:
-    """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run."""
+def _frame_table(pipeline: Pipeline, keyframes: Tensor) -> pa.Table:
+    """Return the table of frames: status, keyframe, and wall and CPU time of each stage, 0 if it did not run.
+
+    Args:
+        pipeline: Pipeline between two frames.
+        keyframes: Timestamps of the keyframes, seconds, float64, shape (K,).
+    """
     slam, times = pipeline.slam, pipeline.record.times
-    own = [keyframe.stamp for keyframe in slam.map.own_keyframes]
     statuses = slam.poses.statuses[: len(times)]  # one more if a frame was interrupted
     wall, cpu = times.wall.T.numpy(), times.cpu.T.numpy()
     columns = {
         "frame": times.indices.numpy(),
         "stamp": times.stamps.numpy(),
         "status": pa.array(statuses, pa.string()),
-        "keyframe": torch.isin(times.stamps, torch.tensor(own, dtype=torch.float64)).numpy(),
+        "keyframe": torch.isin(times.stamps, keyframes).numpy(),
         **{f"seconds_{stage}": seconds for stage, seconds in zip(times.stages, wall, strict=True)},
         **{f"cpu_seconds_{stage}": seconds for stage, seconds in zip(times.stages, cpu, strict=True)},
     }

@@ -139,6 +139,16 @@ def fill_weights(weights: Tensor | None, valid: Tensor) -> Tensor:
     return fill_padding(weights, valid, 0.0)
 
 
+def fill_fixed(fixed: Tensor | None, T: Tensor) -> Tensor:
+    """Return the mask of the poses that an optimiser does not change, bool, shape :math:`(*, P)`.
+
+    Args:
+        fixed: The mask; None for the first pose only.
+        T: Poses, shape :math:`(*, P, 4, 4)`.
+    """
+    return torch.arange(T.shape[-3], device=T.device) == 0 if fixed is None else fixed
+
+
 def check_shapes(**arguments: tuple[Tensor | float | None, *tuple[int | str | None, ...]]) -> torch.Size:
     """Check the shapes of the arguments of a function, and return the broadcast shape of their batches.
 

@@ -23,9 +23,9 @@ def handled_hangup() -> tuple[signal.Signals, ...]:
 
 
 def leave_terminal() -> None:
-    """Send the output that goes to a terminal nowhere, because writing to a terminal that is gone is an error.
+    """Redirect output to a terminal to `os.devnull`, because writing to a lost terminal raises an error.
 
-    A terminal that is gone no longer tells that it is one, so that all devices count; files and pipes stay.
+    `os.isatty` is false for a lost terminal. Therefore every character device is redirected; files and pipes are not.
     """
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for output in _OUTPUTS:

@@ -11,8 +11,8 @@ STATE_METHODS = frozenset({"state_dict", "load_state_dict"})
 class StageProxy:
     """Proxy of a stage: attributes are read from and written to the stage itself.
 
-    To `isinstance`, a proxy is of the class of the stage: a segmenter that is a torch module, for example, has no state
-    that changes from frame to frame.
+    `isinstance` sees the class of the stage. So a segmenter that is a torch module counts as stateless behind a proxy,
+    too, see `segmenter_state_of`.
 
     Args:
         stage: Stage.

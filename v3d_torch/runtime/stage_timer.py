@@ -52,6 +52,11 @@ class StageTimer:
                 wall, cpu = total.get(stage, StageTime())
                 total[stage] = StageTime(wall + elapsed.wall, cpu + elapsed.cpu)
 
+    @property
+    def lap_times(self) -> Mapping[str, StageTime]:
+        """Time of each stage since the last call of `lap`."""
+        return self._lap
+
     def lap(self) -> dict[str, StageTime]:
         """Return the time of each stage since the last call, and start a new lap."""
         lap, self._lap = self._lap, {}

@@ -98,8 +98,8 @@ class FramePreprocessor(ReplaceableStages):
             frame: Frame; frames are segmented in their order, because a segmenter can have state.
             prediction: Pose prediction after an earlier frame, from which the segmenter computes the roll of the
                 camera; None if the pose is not known.
-            is_due: False to skip the frame; None to segment the first frame, and then one of ``segmentation.interval``
-                frames.
+            is_due: True to segment the frame, False to skip it; None to segment the first frame, and then one of
+                ``segmentation.interval`` frames.
 
         Raises:
             ConfigError: If the segmenter did not return valid `Instances`.

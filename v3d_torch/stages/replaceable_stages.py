@@ -32,7 +32,7 @@ _SIMILARITY = 0.8
 """Similarity of two names, from 0 to 1, from which one is a misspelling of the other."""
 
 STAGES = ("segment", *(name for name in RESULTS if name not in ("motion_model", "back_end")))
-"""Names of the stages that `V3DSLAM` calls, for hooks. The others have methods only."""
+"""Names of the stages that can have hooks. Of `motion_model` and `back_end`, `V3DSLAM` calls methods only."""
 
 
 class ReplaceableStages:

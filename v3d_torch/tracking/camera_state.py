@@ -10,7 +10,7 @@ from torch import Tensor
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.se3 import orthonormalise, se3_exp
 from v3d_torch.tracking.motion_model import MAX_EXTRAPOLATION
-from v3d_torch.tracking.pose_kalman_filter import join_covariances, predict_covariance
+from v3d_torch.tracking.pose_kalman_filter import join_covariances, predict_covariance, stop_covariance
 from v3d_torch.types import TrackingStatus
 
 _LOST_AFTER = 1.0
@@ -73,8 +73,7 @@ class CameraState:
         joint, twist = predict_covariance(joint, self.twist, moving), self.twist
         T_wc = orthonormalise(self.T_wc @ se3_exp(twist * moving))
         if stamp - self.stamp > moving:
-            joint[6:, 6:] += twist.outer(twist)
-            twist = twist * 0
+            joint, twist = stop_covariance(joint, twist), twist * 0
             joint = predict_covariance(joint, twist, stamp - self.stamp - moving)
         return CameraState(
             stamp=stamp,

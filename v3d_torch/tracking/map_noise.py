@@ -1,9 +1,9 @@
 """Noise of the map: pose errors of keyframes, which propagate through landmarks to frames and later keyframes.
 
 A landmark has the pose error of the keyframe that created it. A frame that is tracked with landmarks of several
-keyframes has the average of their errors; if it becomes a keyframe, its own error is added. The covariance of the
-errors of any two keyframes is a number, in units of the noise of one frame. The error that a frame inherits from the
-map grows as the camera explores, and shrinks when it observes old landmarks again.
+keyframes has the average of their errors; if it becomes a keyframe, its own error is added. For any two keyframes, the
+covariance of their errors is stored as one number: a multiple of the covariance of a single frame. The error that a
+frame inherits from the map grows as the camera explores, and shrinks when it observes old landmarks again.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class MapNoise(StatefulComponent):
         self._covariance = torch.block_diag(self._covariance, torch.eye(missing, dtype=torch.float64))
 
     def _weights(self, owners: Tensor) -> Tensor:
-        """Fraction of the landmarks that each row created, float64, shape (A,); 0 without landmarks."""
+        """Fraction of the landmarks that each row of the covariance created, float64; 0 without landmarks."""
         self._add_unrelated(int(owners.max()) + 1 if len(owners) else 0)
         counts = torch.bincount(self._rows[owners], minlength=len(self._covariance)).to(torch.float64)
         return counts / max(len(owners), 1)

@@ -76,7 +76,9 @@ class MapTracker:
         """
         # Landmarks matched by the frame-to-frame motion need no search.
         row = torch.searchsorted(local_map.ids, landmarks).clamp(max=max(len(local_map.ids) - 1, 0))
-        in_local_map = (landmarks >= 0) & (local_map.ids[row] == landmarks) if len(local_map.ids) else landmarks < -1
+        in_local_map = torch.zeros_like(landmarks, dtype=torch.bool)
+        if len(local_map.ids):
+            in_local_map = (landmarks >= 0) & (local_map.ids[row] == landmarks)
         feature = torch.nonzero(in_local_map)[:, 0]
         first = self.refine(T_cw, local_map.points[row[feature]], features[feature], rounds=2)
         if first is None:

@@ -12,9 +12,7 @@ from v3d_torch.mapping.keyframe import Keyframe, stack_poses
 from v3d_torch.odometry.odometry import CameraMotion
 from v3d_torch.runtime.stateful import StatefulComponent
 from v3d_torch.runtime.tensor_table import TensorTable
-from v3d_torch.types import FramePose, TrackingStatus, Trajectory
-
-_STATUSES = tuple(TrackingStatus)
+from v3d_torch.types import TRACKING_STATUSES, FramePose, TrackingStatus, Trajectory
 
 
 class PoseHistory(StatefulComponent):
@@ -30,7 +28,7 @@ class PoseHistory(StatefulComponent):
     def __init__(self) -> None:
         self._frames = TensorTable(
             stamp=((), torch.float64),
-            status=((), torch.int64),  # position in TrackingStatus; never DISCONNECTED, which depends on the keyframe
+            status=((), torch.int64),  # in TRACKING_STATUSES; never DISCONNECTED, which depends on the keyframe
             keyframe=((), torch.int64),  # index of the keyframe; -1 for the world frame, before the first keyframe
             T_ck=((4, 4), torch.float64),  # motion from the keyframe to the camera
             is_motion_measured=((), torch.bool),  # true if the motion since the previous frame was measured
@@ -137,7 +135,7 @@ class PoseHistory(StatefulComponent):
             self.observed_landmarks, self._place = new.observed_landmarks, new
         self._frames.append(
             stamp=torch.tensor([stamp], dtype=torch.float64),
-            status=torch.tensor([_STATUSES.index(status)]),
+            status=torch.tensor([TRACKING_STATUSES.index(status)]),
             keyframe=torch.tensor([self._add_keyframe(keyframe)]),
             T_ck=T_ck[None],
             is_motion_measured=torch.tensor([motion.is_measured]),
@@ -166,19 +164,19 @@ class PoseHistory(StatefulComponent):
         """Poses of all frames in the current map; poses of lost frames are interpolated between found frames."""
         frames = self._frames
         T_cw = frames["T_ck"] @ self._keyframe_poses()[frames["keyframe"]]
-        found = frames["status"] != _STATUSES.index(TrackingStatus.LOST)
+        found = frames["status"] != TRACKING_STATUSES.index(TrackingStatus.LOST)
         return Trajectory(frames["stamp"].clone(), invert(_interpolate(frames["stamp"], T_cw, found)))
 
     def _correct_lost(self, T_new_old: Tensor, keyframe: Keyframe | None, linked: bool, *, move_all: bool) -> None:
         """Move the lost frames at the end of the history: all, or those that measured motions link to the new frame."""
         frames = self._frames
         for row in reversed(range(len(frames))):
-            if _STATUSES[int(frames["status"][row])] is not TrackingStatus.LOST or not (linked or move_all):
+            if TRACKING_STATUSES[int(frames["status"][row])] is not TrackingStatus.LOST or not (linked or move_all):
                 break
             frames["T_ck"][row] = _relative(self._pose_of(row) @ invert(T_new_old), keyframe)
             frames["keyframe"][row] = self._add_keyframe(keyframe)
             if linked:
-                frames["status"][row] = _STATUSES.index(TrackingStatus.ODOMETRY)
+                frames["status"][row] = TRACKING_STATUSES.index(TrackingStatus.ODOMETRY)
             linked = linked and bool(frames["is_motion_measured"][row])
 
     def _add_keyframe(self, keyframe: Keyframe | None) -> int:
@@ -194,7 +192,7 @@ class PoseHistory(StatefulComponent):
 
     def _current_status(self, code: int, keyframe: int) -> TrackingStatus:
         """Return the status of a row: a loop can have joined the part of the map of its keyframe with the rest."""
-        status, reference = _STATUSES[code], self._keyframes.get(keyframe)
+        status, reference = TRACKING_STATUSES[code], self._keyframes.get(keyframe)
         is_guess = status.is_localised and reference is not None and reference.is_disconnected
         return TrackingStatus.DISCONNECTED if is_guess else status
 

@@ -89,7 +89,7 @@ class PoseKalmanFilter(StatefulComponent):
 
     def stop(self) -> None:
         """Set the twist to zero, and add its former value to the uncertainty."""
-        self.covariance = self.covariance + torch.block_diag(torch.zeros(6, 6), self.twist.outer(self.twist))
+        self.covariance = stop_covariance(self.covariance, self.twist)
         self.twist = torch.zeros_like(self.twist)
 
 
@@ -114,6 +114,11 @@ def predict_covariance(covariance: Tensor, twist: Tensor, elapsed: float) -> Ten
     F[:6, 6:] = elapsed * np.eye(6)
     density = np.array([[elapsed**3 / 3, elapsed**2 / 2], [elapsed**2 / 2, elapsed]])
     return torch.from_numpy(F @ covariance.numpy() @ F.T + np.kron(density, _TWIST_COVARIANCE.numpy()))
+
+
+def stop_covariance(covariance: Tensor, twist: Tensor) -> Tensor:
+    """Covariance of the errors of pose and twist, (12, 12), after the expected twist, (6,), is set to zero."""
+    return covariance + torch.block_diag(torch.zeros(6, 6), twist.outer(twist))
 
 
 def interpolation_covariances(before: float, after: float) -> tuple[Tensor, Tensor]:

@@ -79,7 +79,7 @@ class PoseNoise(StatefulComponent):
         Args:
             covariance: Nominal covariance, float64, shape :math:`(6, 6)`.
             variances: Variances of its error relative to the variance of a frame: 1 for the noise of the frame, more
-                with that of the map, see `MapNoise`. The minimum ratio is that of the whole error.
+                with that of the map, see `MapNoise`. Their products with the ratios of the axes are limited.
 
         Returns:
             A covariance for each variance, float64, shape :math:`(6, 6)`.

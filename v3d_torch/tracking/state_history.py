@@ -46,10 +46,11 @@ class StateHistory:
         self._history = _History((*states[first:], state))
 
     def append_motion(self, stamp: float, motion: CameraMotion) -> None:
-        """Append the motion to a new frame whose state is not known yet: until `append`, it moves the last state.
+        """Store the measured motion to a frame that is still being tracked.
 
-        The covariance at the new frame is that of a prediction, and so larger than the actual one. A motion that was
-        not measured is ignored, because it is a prediction itself.
+        Until `append` gives the state of that frame, `at` uses the last state, moved by this motion. The covariance at
+        the new frame is that of a prediction, and so larger than the actual one. A motion that was not measured is
+        ignored, because it is a prediction itself.
 
         Args:
             stamp: Time of the new frame, seconds.
@@ -63,8 +64,8 @@ class StateHistory:
         """Return the state at a time.
 
         Between two frames the pose is interpolated along the geodesic. The covariance includes the unknown motion
-        between them, which is large in a gap of the frames, and is an upper bound for any correlation of the errors of
-        both frames. After the last frame see `CameraState.predict`.
+        between them, which is large in a gap of the frames. It is large enough whatever the correlation between the
+        errors of both frames. After the last frame see `CameraState.predict`.
 
         Args:
             stamp: Time, seconds.

@@ -32,8 +32,9 @@ from v3d_torch.export.ros.bag_file import BagFile
 from v3d_torch.export.ros.bag_viewer import BagViewer
 from v3d_torch.export.ros.frames import camera_in_map, map_frame, points_in_map
 from v3d_torch.export.ros.messages import occupancy_grid, transforms
+from v3d_torch.export.ros.run_messages import RunMessages
 from v3d_torch.frame_result import FrameResult
-from v3d_torch.geometry.se3 import invert, se3_exp
+from v3d_torch.geometry.se3 import invert, se3_exp, transform_points
 from v3d_torch.occupancy.occupancy_grid import OccupancyGrid
 from v3d_torch.pipeline import Pipeline
 from v3d_torch.reconstruction.point_map import PointMap
@@ -387,3 +388,15 @@ def test_transform_from_map_and_objects_are_left_out_while_the_place_is_a_guess(
         assert (("map", "odom") in frames) == (index not in guessed)
         assert ("odom", "camera_link") in frames
     assert {round(time / 1e8) for time, _ in messages["/cloud"]}.isdisjoint(guessed)
+
+
+def test_cloud_is_that_of_the_time_of_the_colour_image() -> None:
+    """The camera moved between both images, so that the wall was displaced in the cloud."""
+    slam, frame = V3DSLAM(CAMERA, squares, CONFIG), Wall()[0]
+    result = slam(frame)
+    T_dc = se3_exp(torch.tensor([0.05, -0.02, 0.1, 0.01, 0.02, -0.03], dtype=torch.float64))
+    points = []
+    for each in (result, replace(result, T_dc=T_dc)):
+        clouds = [message for topic, message in RunMessages(CAMERA).of_frame(frame, each, slam) if topic == "/cloud"]
+        points.append(torch.from_numpy(points_of(clouds[0])[0]))
+    np.testing.assert_allclose(points[1], transform_points(invert(T_dc), points[0]), atol=1e-5)

@@ -33,8 +33,9 @@ from v3d_torch.export.ros import frames
 from v3d_torch.export.ros.markers import no_markers, object_markers
 from v3d_torch.export.ros.messages import camera_info, occupancy_grid, odometry, path, transforms
 from v3d_torch.export.ros.point_cloud import point_cloud
+from v3d_torch.frame_result import FrameResult
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.se3 import invert
+from v3d_torch.geometry.se3 import invert, transform_points
 from v3d_torch.mapping.keyframe import stack_poses
 from v3d_torch.objects.frame_objects import FrameObjects
 from v3d_torch.reconstruction.point_map import PointMap
@@ -106,7 +107,7 @@ class RunMessages:
         yield "/objects", object_markers(stamp, objects, slam.up, self._T_mw)
         self._has_markers = True
         if slam.map.newest_keyframe_at(stamp) is not None:
-            yield "/cloud", self._cloud(frame, objects.map_mask)
+            yield "/cloud", self._cloud(frame, objects)
             own = slam.map.own_keyframes
             T_ml = frames.camera_in_map(invert(stack_poses(own)), self._T_mw)
             yield "/path", path(stamp, frames.MAP, [each.stamp for each in own], T_ml)
@@ -182,10 +183,13 @@ class RunMessages:
             tree[frames.CAMERA, frames.OPTICAL] = frames.T_LINK_OPTICAL  # every time: a replay can start later
         return transforms(stamp, tree)
 
-    def _cloud(self, frame: RGBDFrame, static: Tensor) -> Message:
+    def _cloud(self, frame: RGBDFrame, objects: FrameObjects) -> Message:
+        """Make the cloud of the static pixels at the time of the colour image, which the stamp of the frame is."""
         step = slice(None, None, _CLOUD_STRIDE)
-        keep = static[step, step] & (frame.depth[0, step, step] > 0)
+        keep = objects.map_mask[step, step] & (frame.depth[0, step, step] > 0)
         points = self._camera.rays[step, step][keep] * frame.depth[0, step, step][keep][:, None]
+        if isinstance(objects, FrameResult):
+            points = transform_points(invert(objects.T_dc), points)
         return point_cloud(frame.stamp, frames.OPTICAL, points, frame.image[:, step, step].permute(1, 2, 0)[keep])
 
 
