@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,7 @@ from hypothesis import settings
 from rich.console import Console
 
 from v3d_torch.io.paths import cache_dir
+from v3d_torch.runtime.hangup import HANGUP
 
 if TYPE_CHECKING:
     from v3d_torch.datasets import RGBDSequence
@@ -50,6 +52,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """Compile all kernels before the tests, whose time is limited; with ``-n``, the first worker does it."""
     if config.getoption("numprocesses", None):  # this process starts the workers, and runs no tests
         return
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored by programs that a shell runs in the background
+    for hangup in HANGUP:
+        signal.signal(hangup, signal.SIG_DFL)  # ignored by nohup
     gc.disable()  # until all tests are collected
     # Imports that take seconds.
     import torch
