@@ -180,7 +180,5 @@ def test_segmenter_gets_no_pose_before_relocalisation(wall: tuple[Path, Pipeline
 def test_map_that_was_loaded_with_another_configuration_is_rejected(wall: tuple[Path, Pipeline]) -> None:
     """The system changed a map that it only localises in."""
     known = load_map(wall[0], CAMERA, CONFIG).map
-    with pytest.raises(
-        ConfigError, match=r"^the known map was loaded with other values in the sections mapping or"
-    ):
+    with pytest.raises(ConfigError, match=r"^the known map was loaded with other values in the sections mapping or"):
         V3DSLAM(CAMERA, NoSegmentation(), LOCALISE, known)

@@ -92,3 +92,14 @@ def test_disabled_compensation_leaves_the_depth_unchanged(features: Features, de
     assert_equal(
         disabled(features, depth, DELAY, VELOCITY, KINECT), compensate_rolling_shutter(features, VELOCITY, KINECT)
     )
+
+
+def test_second_compensation_replaces_the_first_also_beside_depth_edges(features: Features) -> None:
+    depth = torch.full((1, CAMERA.height, CAMERA.width), 3.0)
+    depth[:, :, 250:280], depth[:, 100:130, :] = 1.2, 0.0  # a pole before a wall, and a gap
+    observed = replace(features, depth=sample_depth(features.pixel, depth, max_depth=8.0))
+    once = compensate(observed, depth, DELAY, VELOCITY, KINECT)
+    for first in (VELOCITY, -3 * VELOCITY):
+        twice = compensate(compensate(observed, depth, DELAY, first, KINECT), depth, DELAY, VELOCITY, KINECT)
+        torch.testing.assert_close(twice.depth, once.depth, rtol=0, atol=1e-12)
+        torch.testing.assert_close(twice.uv, once.uv, rtol=0, atol=1e-9)

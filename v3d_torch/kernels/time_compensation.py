@@ -23,9 +23,19 @@ def _motion_field(
     return (w * vx + wy - wz * y - x * s) * fx, (w * vy + wz * x - wx - y * s) * fy, -s * w
 
 
-@kernel("(f8[:,::1], i8[:,::1], f8[::1], f4[:,::1], f8[::1], f8, f8, UniTuple(f8, 4))")
+@device
+def _depth_at(depth_image: Floats32, column: float, row: float, max_depth: float) -> float:
+    """Depth at a pixel with whole coordinates, metres; 0 outside of the image, and above the maximum."""
+    height, width = depth_image.shape
+    if not (0 <= column < width and 0 <= row < height):
+        return 0.0
+    z = np.float64(depth_image[int(row), int(column)])
+    return z if 0 < z <= max_depth else 0.0
+
+
+@kernel("(f8[:,::1], i8[:,::1], f4[:,::1], f8[::1], f8, f8, UniTuple(f8, 4))")
 def compensate_depth_delay(
-    uv: Floats, pixel: Ints, inverse_depth: Floats, depth_image: Floats32, velocity: Floats,
+    uv: Floats, pixel: Ints, depth_image: Floats32, velocity: Floats,
     delay: float, max_depth: float, intrinsics: PinholeIntrinsics,
 ) -> Floats:  # fmt: skip
     """Depth of features at the time of the colour image, metres, (N,); 0 = no measurement.
@@ -33,23 +43,21 @@ def compensate_depth_delay(
     Args:
         uv: Undistorted pixels of the features, (N, 2).
         pixel: (column, row) in the recorded image, (N, 2).
-        inverse_depth: Inverse depth before the compensation, 1/m, (N,); 0 = no measurement.
         depth_image: Depth image, metres, (H, W); 0 = no measurement.
         velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, (6,).
         delay: Time of the depth image minus time of the colour image, seconds.
         max_depth: Depth above this counts as missing, metres.
         intrinsics: ``fx, fy, cx, cy``.
     """
-    height, width = depth_image.shape
     depth = np.zeros(len(uv))
     for i in range(len(uv)):
-        du, dv, _ = _motion_field(uv[i, 0], uv[i, 1], inverse_depth[i], velocity, intrinsics)
+        z = _depth_at(depth_image, pixel[i, 0], pixel[i, 1], max_depth)
+        du, dv, _ = _motion_field(uv[i, 0], uv[i, 1], 1 / z if z > 0 else 0.0, velocity, intrinsics)
         column, row = np.rint(pixel[i, 0] + delay * du), np.rint(pixel[i, 1] + delay * dv)
-        if 0 <= column < width and 0 <= row < height:
-            z = np.float64(depth_image[int(row), int(column)])
-            if 0 < z <= max_depth:
-                _, _, rate = _motion_field(uv[i, 0], uv[i, 1], 1 / z, velocity, intrinsics)
-                depth[i] = z / (1 - delay * rate * z)
+        z = _depth_at(depth_image, column, row, max_depth)
+        if z > 0:
+            _, _, rate = _motion_field(uv[i, 0], uv[i, 1], 1 / z, velocity, intrinsics)
+            depth[i] = z / (1 - delay * rate * z)
     return depth
 
 

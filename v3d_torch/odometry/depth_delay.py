@@ -32,7 +32,6 @@ def _compensate_compiled(
     new_depth = kernels.compensate_depth_delay(
         to_array(features.uv),
         to_array(features.pixel),
-        to_array(features.inverse_depth),
         to_array(depth[0]),
         to_array(velocity),
         delay,
@@ -59,12 +58,13 @@ class DepthDelayCompensation:
     def __call__(self, features: Features, depth: Tensor, velocity: Tensor, delay: float) -> Features:
         r"""Sample the depth of features at the time of the depth image, and convert it to the time of the colour image.
 
-        With delay :math:`\tau`, sampled depth :math:`z` and rate :math:`\dot w` of its inverse by the motion
-        field, the depth at the time of the colour image is :math:`z / (1 - \tau \dot w z)`. The given depth of a
-        feature beside a depth edge can be that of another surface, with another rate.
+        A feature moves between the images with the depth at its pixel. With delay :math:`\tau`, the depth :math:`z`
+        where it moves to, and the rate :math:`\dot w` of its inverse by the motion field, the depth at the time of the
+        colour image is :math:`z / (1 - \tau \dot w z)`. Beside a depth edge, both depths can be those of different
+        surfaces. The depth that the features had before is not used.
 
         Args:
-            features: Features of the colour image.
+            features: Features of the colour image, where they were observed.
             depth: Depth image, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             velocity: Twist ``[m/s, rad/s]`` by which static points move in the camera frame, float64, shape
                 :math:`(6,)`.
@@ -76,8 +76,14 @@ class DepthDelayCompensation:
         """
         if not delay or not self._enabled:
             return features
-        pixel_velocity, _ = motion_field(features.uv, features.inverse_depth, velocity, self._camera.K)
+        z = sample_depth(features.pixel, depth, self._max_depth)
+        pixel_velocity, _ = motion_field(features.uv, _invert(z), velocity, self._camera.K)
         shifted = (features.pixel + delay * pixel_velocity).round().to(torch.int64)
         z = sample_depth(shifted, depth, self._max_depth)
-        _, rate = motion_field(features.uv, torch.where(z > 0, 1 / z, 0.0), velocity, self._camera.K)
+        _, rate = motion_field(features.uv, _invert(z), velocity, self._camera.K)
         return replace(features, depth=torch.where(z > 0, z / (1 - delay * rate * z), 0.0))
+
+
+def _invert(z: Tensor) -> Tensor:
+    """Return the inverse of depths; 0 for those that are not measured."""
+    return torch.where(z > 0, 1 / z, 0.0)

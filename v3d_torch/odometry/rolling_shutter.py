@@ -237,6 +237,12 @@ def compensate_features(features: Features, velocity: Tensor, readout: Readout, 
     return replace(features, uv=uv, readout_jacobian=readout_jacobian)
 
 
+def undo_compensation(features: Features, readout: Readout) -> Features:
+    """Return the features where they were observed, the inverse of `compensate_features` with the same readout."""
+    uv = features.uv - readout.seconds * features.readout_jacobian
+    return replace(features, uv=uv, readout_jacobian=torch.zeros_like(uv))
+
+
 class RollingShutterCompensation(SettingsModule):
     """:func:`compensate_rolling_shutter` as a module. A readout given as a `torch.nn.Parameter` can be learned.
 

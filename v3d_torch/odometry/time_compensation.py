@@ -8,7 +8,7 @@ from v3d_torch.config import Config
 from v3d_torch.features.features import Features
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.odometry.depth_delay import DepthDelayCompensation
-from v3d_torch.odometry.rolling_shutter import Readout, compensate_features
+from v3d_torch.odometry.rolling_shutter import Readout, compensate_features, undo_compensation
 
 
 class TimeCompensation:
@@ -38,5 +38,6 @@ class TimeCompensation:
                 :math:`(6,)`.
             readout: Readout of the camera.
         """
-        features = self._compensate_depth_delay(features, depth, velocity, depth_delay + self._depth_delay)
-        return compensate_features(features, velocity, readout, self._camera)
+        observed = undo_compensation(features, readout)
+        delayed = self._compensate_depth_delay(observed, depth, velocity, depth_delay + self._depth_delay)
+        return compensate_features(delayed, velocity, readout, self._camera)
