@@ -99,6 +99,17 @@ def test_second_detection_of_an_object_starts_no_track(visible: slice) -> None:
         assert [track.id for track in tracks] == [1]
 
 
+def test_instance_of_two_pixels_starts_no_track() -> None:
+    """Such as the rest of a person who goes behind another, which became a person of its own."""
+    track_boards = BoardTracker()
+    depth, instances = render([Board(0.0), Board(0.7)])
+    instances.masks[1] = False
+    instances.masks[1, 41, 41:43] = True
+    for frame in range(3):
+        tracks = track_boards.track(depth, instances, frame / 30)
+        assert [track.id for track in tracks] == [1]
+
+
 def test_part_and_whole_that_appear_in_the_same_frame_are_one_object() -> None:
     """The part has the higher score, so that the suppression of duplicates keeps both."""
     track_boards = BoardTracker()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -73,3 +74,14 @@ def test_depth_step_is_not_smooth() -> None:
     assert not smooth[:, 10].any()
     assert np.delete(smooth, 10, axis=1).all()
     assert find_smooth_pixels(depth, STEP, 0.2).all()
+
+
+@pytest.mark.parametrize("roll", [0, 30, 45, 60, 90, 135])
+def test_foot_on_the_floor_is_found_at_any_roll_of_the_camera(roll: float) -> None:
+    """Rows and columns cross a diagonal edge at a shorter distance, over which the bend is too small."""
+    v, u = np.mgrid[:ROWS, :COLUMNS] - np.array([ROWS // 2, COLUMNS // 2])[:, None, None]
+    below = np.cos(np.radians(roll)) * v + np.sin(np.radians(roll)) * u
+    per_cell = STEP / (FOCAL_LENGTH * FLOOR)
+    edges = find_concave_edges(depth_from(0.5 + per_cell * np.maximum(below, 0)))
+    inner = edges[4:-4, 4:-4], np.abs(below)[4:-4, 4:-4]
+    assert inner[0][inner[1] < 0.5].all() and not inner[0][inner[1] > 3].any()

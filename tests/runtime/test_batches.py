@@ -94,3 +94,19 @@ def test_check_shapes_returns_the_batch_of_arguments_whose_named_sizes_are_equal
 def test_check_shapes_rejects_a_named_size_that_differs() -> None:
     with pytest.raises(ShapeError, match=r"^weights has the shape \(4,\); give a tensor of shape \(\.\.\., 5\)$"):
         check_shapes(uv=(torch.zeros(5, 2), "N", 2), weights=(torch.ones(4), "N"))
+
+
+def test_shapes_that_change_are_checked_in_one_compiled_graph() -> None:
+    """Clouds have another size in each frame; the second size could not be compiled."""
+    torch.compiler.reset()
+
+    def add(a: Tensor, b: Tensor) -> Tensor:
+        check_shapes(a=(a, "N", 3), b=(b, "N", 3))
+        return a + b
+
+    compiled = torch.compile(add, fullgraph=True, backend="eager")
+    for count in (5, 7, 9):
+        each = torch.rand(2, count, 3)
+        assert torch.equal(compiled(each, each), 2 * each)
+    with pytest.raises(ShapeError):
+        check_shapes(a=(torch.rand(2, 5, 3), "N", 3), b=(torch.rand(2, 6, 3), "N", 3))

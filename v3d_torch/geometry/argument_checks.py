@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from numbers import Integral
 
 import torch
@@ -23,15 +24,21 @@ def check_shape(name: str, value: object, *dimensions: int | str) -> None:
         InputError: If the value is no tensor.
         ShapeError: If it has another shape.
     """
-    expected = f"({', '.join('...' if d == '*' else str(d) for d in dimensions)})"
     if not isinstance(value, Tensor):
+        expected = _describe_shape(dimensions)
         raise InputError(f"{name} is of type {type(value).__name__}; give a torch.Tensor of shape {expected}")
-    last = dimensions[1:] if dimensions[:1] == ("*",) else dimensions
-    has_dimensions = value.ndim == len(last) or (last is not dimensions and value.ndim > len(last))
+    has_batch = dimensions[:1] == ("*",)
+    last = dimensions[1:] if has_batch else dimensions
+    has_dimensions = value.ndim == len(last) or (has_batch and value.ndim > len(last))
     sizes = value.shape[value.ndim - len(last) :]
     if not has_dimensions or any(isinstance(d, int) and d != size for d, size in zip(last, sizes, strict=True)):
-        message = f"{name} has the shape {tuple(value.shape)}; give a tensor of shape {expected}"
+        message = f"{name} has the shape {tuple(value.shape)}; give a tensor of shape {_describe_shape(dimensions)}"
         raise ShapeError(message, actual_shape=list(value.shape), expected_shape=[str(d) for d in dimensions])
+
+
+def _describe_shape(dimensions: Sequence[int | str]) -> str:
+    """Return a shape as text, only for errors: a compiler cannot trace the text of a size that changes."""
+    return f"({', '.join('...' if d == '*' else str(d) for d in dimensions)})"
 
 
 def check_masks(**masks: object) -> None:

@@ -28,6 +28,10 @@ from v3d_torch.objects.track_matching import (
 from v3d_torch.segmentation.coco import UNLABELLED
 from v3d_torch.types import STAMP_TOLERANCE, Instances
 
+_MIN_COARSE_PIXELS = 4
+"""Minimum number of pixels of its coarse mask with which an instance starts a track: no overlap can be measured with
+fewer."""
+
 _DUPLICATE_COVERAGE = 0.7
 """Minimum overlap of an unmatched instance with a matched one of its class from which both are the same object, as a
 fraction of the smaller mask: the network finds a person and also a part of this person."""
@@ -146,11 +150,13 @@ class InstanceTracker(torch.nn.Module):
         predicted = predict_tracks(others, stamp, depth, invert(T_wc), camera, self._clouds, stride)
         matches |= self._match(predicted, detected, matches)
 
-        # Update matched tracks, and start a track for each instance without a match, unless it shows a matched object.
+        # Update matched tracks, and start a track for each instance without a match, unless it shows a matched object
+        # or is tiny, such as the rest of a person who goes behind another.
         updated: list[Track] = []
+        is_tiny = (count_pixels(detected.coarse_masks) < _MIN_COARSE_PIXELS).tolist()
         for i, detection in enumerate(detected.detections):
             track = matches.get(i)
-            if track is None and self._is_duplicate(i, matches, detected):
+            if track is None and (is_tiny[i] or self._is_duplicate(i, matches, detected)):
                 continue
             masks = instances.masks[i], clouds.cloud_pixels[i], detected.coarse_masks[i]
             track = matches[i] = track or self._start_track(stamp, masks)

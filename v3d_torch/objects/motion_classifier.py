@@ -88,6 +88,9 @@ class MotionClassifier(StatefulComponent):
         # Motion states, with memory over frames.
         fractions, config = evidence.free_space.appeared_fractions, self._config.static_mask
         motion_states = {track: decide_motion_state(track, fractions[track], stamp, config) for track in tracks}
+        for track, motion_state in motion_states.items():
+            if motion_state is MotionState.STATIC:
+                track.motion.mark_at_rest()
 
         # Masks, refined by depth, and the positions that they show.
         excluded = [track for track in tracks if not self._is_trackable(motion_states[track])]

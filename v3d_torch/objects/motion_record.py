@@ -21,6 +21,7 @@ class MotionRecord:
         dynamic_frames: Number of frames in which free space, votes or features showed a motion of the object.
         last_dynamic: Timestamp of the last of these frames, seconds.
         last_shifted: Timestamp of the last frame in which its features had moved against the camera motion, seconds.
+        is_shifting: True from such a frame until the object is observed at rest.
         last_deforming: Timestamp of the last frame in which the object deformed, see `chamfer_evidence`, seconds.
         supported_since: Timestamp of the first of the consecutive frames, up to the newest, in which its features fit
             the camera motion, seconds; infinity if they do not fit in the newest frame.
@@ -29,6 +30,7 @@ class MotionRecord:
     dynamic_frames: int = 0
     last_dynamic: float = -inf
     last_shifted: float = -inf
+    is_shifting: bool = False
     last_deforming: float = -inf
     supported_since: float = inf
     _shifts: list[tuple[float, FeatureShift]] = field(default_factory=list)  # by the time of the frame
@@ -65,9 +67,13 @@ class MotionRecord:
         self._shifts.append((stamp, shift))
         is_long = stamp - self._shifts[0][0] >= _MIN_SHIFT_TIME * time_span - STAMP_TOLERANCE
         if is_long and sum_shifts(each for _, each in self._shifts).is_motion:
-            self.last_shifted = stamp
+            self.last_shifted, self.is_shifting = stamp, True
+
+    def mark_at_rest(self) -> None:
+        """Record that the object is observed at rest."""
+        self.is_shifting = False
 
     def restart(self) -> None:
         """Forget what is measured over consecutive frames, because the object was lost in between."""
-        self.supported_since = inf
+        self.supported_since, self.is_shifting = inf, False
         self._shifts = []

@@ -36,7 +36,7 @@ def decide_motion_state(
         config: Times for which evidence counts.
     """
     motion = track.motion
-    # A shift counts for a while: features of a masked object are not matched, and free space shows no slow motions.
+    # A shift counts for a while, because over a short time free space shows no slow motion.
     has_shifted = stamp - motion.last_shifted <= config.hold_dynamic_time
     if motion.last_dynamic == stamp or has_shifted:
         return MotionState.DYNAMIC
@@ -49,7 +49,9 @@ def decide_motion_state(
     known = [rest for rest, fraction in zip(at_rest, appeared_fractions, strict=True) if not isnan(fraction)]
     if track.has_rigid_label and known and all(known):
         return MotionState.STATIC
-    if is_held_dynamic(track, stamp, config):
+    # Features of a masked object are not matched, so that they cannot show that it still moves.
+    is_shifting = track.has_rigid_label and motion.is_shifting
+    if is_shifting or is_held_dynamic(track, stamp, config):
         return MotionState.DYNAMIC
     if stamp - motion.last_deforming <= config.hold_dynamic_time:
         return MotionState.DEFORMING
