@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from v3d_torch.batch.executor import JobFinished
 from v3d_torch.batch.job import Job
 from v3d_torch.config import Config
 from v3d_torch.evaluation.outcome import Outcome
+from v3d_torch.io.files import write_text
 from v3d_torch.runs.request import RunRequest
 
 RESULTS_PAGE = Path(v3d_torch.__file__).parents[1] / "docs" / "results.md"
@@ -47,3 +49,13 @@ def test_sequence_of_the_newest_outcome_is_last(tmp_path: Path) -> None:
     assert newest_last == [("attic", "full"), ("attic", "paper"), ("hall", "full"), ("hall", "paper")]
     record.add(JobFinished(jobs[2], "it broke"))
     assert record.outcomes_newest_last[-1].sequence == "cellar"
+
+
+def test_path_that_is_not_utf8_is_written_with_escapes(tmp_path: Path) -> None:
+    """The error ended the whole batch."""
+    job = Job("room", 1, "", "full", RunRequest("room", Config()), tmp_path / "room" / "full" / "seed0")
+    failure = f"{os.fsdecode(b'v' + bytes([255]))}.png: is damaged"
+    write_runs(tmp_path / "runs.parquet", [(job, job.make_outcome(failure))])
+    assert pq.read_table(tmp_path / "runs.parquet")["failure"].to_pylist() == ["v\\udcff.png: is damaged"]
+    write_text(tmp_path / "summary.md", failure)
+    assert (tmp_path / "summary.md").read_text() == "v\\udcff.png: is damaged"

@@ -201,3 +201,13 @@ def test_static_recording_has_no_poses_of_frames_whose_place_is_a_guess(tmp_path
     left_out = frames - len(estimate)
     assert left_out > 10 and len(estimate) >= 26
     assert f"note: {left_out} frames without a known pose are left out of estimated_trajectory.txt" in output.getvalue()
+
+
+def test_folder_and_configuration_are_checked_before_the_source_is_opened(tmp_path: Path) -> None:
+    """A download of half a gigabyte came first."""
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "diary.txt").write_text("")
+    done = call("--seq", tmp_path / "missing", "--out", tmp_path / "full")
+    assert_error_line(done, "already exists and is not an empty folder")
+    done = call("--seq", tmp_path / "missing", "--static", "--config", tmp_path / "no.yaml", "--out", tmp_path / "new")
+    assert_error_line(done, "no.yaml")

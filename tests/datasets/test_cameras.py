@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from helpers.tiny_images import CAMERA_YAML
 
-from v3d_torch.datasets.cameras import PRESETS, load_camera
+from v3d_torch.datasets.cameras import PRESETS, choose_camera, load_camera
 from v3d_torch.errors import InputError
 from v3d_torch.geometry.camera import PinholeCamera
 
@@ -79,3 +79,10 @@ def test_invalid_camera_file_is_rejected(tmp_path: Path, name: str, text: str, m
 def test_unknown_preset_suggests_the_most_similar() -> None:
     with pytest.raises(InputError, match="did you mean tum_fr3"):
         load_camera("tum-fr3")
+
+
+def test_error_of_a_distortion_names_the_camera_file(tmp_path: Path) -> None:
+    text = "{width: 640, height: 480, fx: 525, fy: 525, cx: 319.5, cy: 239.5, distortion: [-3, 0, 0, 0, 0]}"
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"camera\.yaml: the distortion "):
+        choose_camera(None, tmp_path)

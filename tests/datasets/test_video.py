@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -158,3 +159,19 @@ def test_truncated_video_raises_after_its_last_frame(folder: Path) -> None:
         next(frames)
     with pytest.raises(InputError, match=r"rgb\.avi: is truncated at \d\.\d of 3\.0 s; copy it again$"):
         next(frames)
+
+
+def test_name_like_a_protocol_is_a_file(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """FFmpeg read the time of day as a protocol."""
+    (folder / "rgb.avi").rename(folder / "10:30.avi")
+    (folder / "depth.mkv").rename(folder / "10:30_depth.mkv")
+    monkeypatch.chdir(folder)
+    assert len(load_sequence("10:30.avi")) == 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="all names are Unicode")
+def test_name_that_is_not_utf8_is_an_input_error(folder: Path) -> None:
+    """OpenCV ended the process."""
+    renamed = folder.rename(folder.parent / os.fsdecode(b"v\xffid"))
+    with pytest.raises(InputError, match=r"has a name that is not UTF-8; rename the file and its folders$"):
+        load_sequence(str(renamed))

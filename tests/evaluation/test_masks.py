@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -351,3 +352,9 @@ def test_unsure_pixels_count_neither_for_nor_against_an_object() -> None:
     truth[20:40, 20:40] = UNSURE
     truth[23:37, 23:37] = 1
     assert covering_ids(truth, torch.tensor([1]), {7: truth > 0}).tolist() == [7]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="all names are Unicode")
+def test_true_masks_in_a_folder_whose_name_is_not_utf8_are_read(folder: Path) -> None:
+    renamed = folder.rename(folder.parent / os.fsdecode(b"v\xffwall"))
+    assert TUMSequence(renamed).motion_mask(0) is not None

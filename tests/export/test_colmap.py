@@ -174,3 +174,13 @@ def test_large_map_is_thinned_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyP
     write_colmap(tmp_path, CAMERA, posed_images(), (points, colours), nothing)
     written = [point["xyz"][0] for _, point in sorted(read_model(tmp_path / "sparse" / "0").points.items())]
     assert written == [0, 9, 18, 27]
+
+
+def test_image_point_outside_of_the_image_is_left_out(tmp_path: Path) -> None:
+    """Features beside the border of a distorted image are outside of the undistorted one."""
+    edge = CAMERA.width - 0.5
+    uv = torch.tensor([[edge, 60.0], [-47.6, -30.9], [edge, 60.0], [edge, 123.0]], dtype=torch.float64)
+    tracks = LandmarkTracks(POINTS[:1], torch.tensor([0, 0, 1, 1]), torch.tensor([0, 0, 0, 0]), uv)
+    write_colmap(tmp_path, CAMERA, posed_images(), (torch.zeros(0, 3), torch.zeros(0, 3, dtype=torch.uint8)), tracks)
+    model = read_model(tmp_path / "sparse" / "0")
+    assert [len(image["points"]) for _, image in sorted(model.images.items())] == [1, 1]

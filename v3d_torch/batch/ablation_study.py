@@ -102,6 +102,8 @@ def run_ablation_study(
         for variant, config in variant_configs.items()
         for seed in range(seeds)
     }
+    if out is not None:
+        _check_folder(out)  # before sequences are opened, which can download them
     requests = [RunRequest.of_sequence(name, data_root, camera=camera, fps=fps) for name in names]
     sequences = open_sequences(requests, console)
     network = cache(make_instance_source)
@@ -139,9 +141,7 @@ def _run_variants(
         network: Function that returns the network of a configuration.
         console: Console for progress and tables.
     """
-    for table, contents in ((STUDY_TABLE, "an earlier study"), (RUNS_TABLE, "a batch")):
-        if (folder / table).exists():
-            raise InputError(f"{folder}: contains {contents}; choose another folder with --out")
+    _check_folder(folder)
     outcomes: list[Outcome] = []
     try:
         for name, opened in sequences.items():
@@ -164,6 +164,17 @@ def _run_variants(
         done, total = len(outcomes), len(configs) * len(sequences)
         raise RunError(f"interrupted after {done} of {total} runs; their results are in {folder}") from interrupt
     return outcomes
+
+
+def _check_folder(folder: Path) -> None:
+    """Check that a folder has no results of other runs.
+
+    Raises:
+        InputError: If it has.
+    """
+    for table, contents in ((STUDY_TABLE, "an earlier study"), (RUNS_TABLE, "a batch")):
+        if (folder / table).exists():
+            raise InputError(f"{folder}: contains {contents}; choose another folder with --out")
 
 
 def _check_differences(configs: Mapping[str, Config], overrides: Sequence[str]) -> None:

@@ -23,6 +23,7 @@ from v3d_torch.evaluation.summary import (
 from v3d_torch.evaluation.tables import ErrorTable
 from v3d_torch.io.files import write_text
 from v3d_torch.io.parquet_file import write_parquet
+from v3d_torch.io.text import printable
 from v3d_torch.types import TrackingStatus
 
 METRIC_TYPES: Mapping[str, pa.DataType] = {
@@ -177,9 +178,9 @@ def _row(job: Job, outcome: Outcome, folder: Path) -> dict[str, object]:
         "seed": outcome.seed,
         **{key.replace(".", "_"): outcome.get_metric(key) for key in METRIC_TYPES},
         "difference": outcome.difference,
-        "warnings": "\n".join(outcome.warnings),
-        "failure": outcome.failure,
-        "diagnosis": outcome.diagnosis,
+        "warnings": "\n".join(map(printable, outcome.warnings)),  # Parquet has no names that are not UTF-8
+        "failure": None if outcome.failure is None else printable(outcome.failure),
+        "diagnosis": None if outcome.diagnosis is None else printable(outcome.diagnosis),
         "path": _relative_path(job, folder),
     }
 

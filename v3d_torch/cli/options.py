@@ -87,7 +87,8 @@ class PathCommand(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the command line after checking its paths.
 
-        They are checked here because the values of options are paths without a trace of the empty text.
+        They are checked here because Typer makes an empty text the path of the current folder, which later code cannot
+        tell from a dot.
         """
         kinds = get_type_hints(self.callback)
         paths = {name for option in self.params if kinds.get(str(option.name)) in _PATHS for name in option.opts}

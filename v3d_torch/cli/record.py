@@ -51,6 +51,7 @@ def main(
         from v3d_torch.datasets import SourceOptions, open_source
         from v3d_torch.datasets.stored import StoredSequence
         from v3d_torch.errors import ConfigError, InputError, RunError
+        from v3d_torch.io.files import check_empty_folder
         from v3d_torch.runs.interrupts import interrupts_between_frames
         from v3d_torch.runs.open_sequences import print_notes
         from v3d_torch.runs.print_line import print_line
@@ -59,19 +60,21 @@ def main(
     with exit_on_error():
         if config is not None and not static:
             raise ConfigError(f"--config {config}: has an effect with --static only; remove it")
+        static_config = load_config(find_config(FULL if config is None else config)) if static else None
+        check_empty_folder(out)  # before the source is opened, which can download it
         with console.status(f"opening {seq}"):
             options = SourceOptions(rgb_topic, depth_topic, info_topic, fps)
             source = open_source(seq, data_root=data_root, camera=camera, options=options)
         print_notes(source, console)
         with interrupts_between_frames(source) as interrupted:
-            if static:
-                frames, failure = record_static(
-                    source, out, load_config(find_config(FULL if config is None else config)), interrupted, console
-                )
+            if static_config is not None:
+                frames, failure = record_static(source, out, static_config, interrupted, console)
             else:
                 frames, failure = record_all(source, out, interrupted, console), None
         if failure is not None:
             raise RunError(f"{failure} (the {frames} frames before are saved in {out})")
+        if not frames and interrupted.is_set():
+            raise RunError("interrupted before the first frame")
         if not frames:
             raise InputError(f"{seq}: the source ended before its first frame")
         print_line(console, f"{frames} frames: {out}")

@@ -99,7 +99,7 @@ def choose_camera(
     else:
         file = camera_file(folder)
         chosen = load_camera(file, image_size) if file is not None else _published_camera(folder, stated)
-        check_distortion(chosen, folder)
+        check_distortion(chosen, folder if file is None else file)
     if chosen.depth_scale is not None:
         return chosen
     if depth_scale is None:

@@ -61,7 +61,9 @@ class ImageFolder(PairedImages):
             for stamp, pair in sorted(zip(stamps, files, strict=True))
         ]
         if fps is None:
-            check_stamp_unit(pairs, folder)
+            check_stamp_unit(
+                pairs, folder, ", or pass the frame rate with --fps if file names only look like timestamps"
+            )
         super().__init__(folder, pairs, camera, pairing_note=note)
 
 

@@ -24,7 +24,7 @@ _SAMPLES = 8
 class ImageSequence(StoredSequence):
     """Base class of sequences that read the colour and depth image of a frame separately.
 
-    The constructor of a subclass ends with `_settle_depth_scale`.
+    A subclass whose depth scale can be unknown calls `_settle_depth_scale` at the end of its constructor.
 
     Args:
         name, stamps, camera, groundtruth, delays: As for `StoredSequence`.

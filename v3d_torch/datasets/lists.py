@@ -224,8 +224,13 @@ def depth_delay(colour: float, depth: float) -> float:
     return depth - colour if abs(depth - colour) <= MAX_STAMP_DIFFERENCE else 0.0
 
 
-def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
+def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path, other_fix: str = "") -> None:
     """Check that the time between images is plausible for timestamps in seconds.
+
+    Args:
+        pairs: Images in the order of time.
+        folder: Folder of the images, for messages.
+        other_fix: End of the messages: what the user can do besides converting the timestamps.
 
     Raises:
         InputError: If the images are so far apart, or so close to each other, that the timestamps must be in another
@@ -237,12 +242,12 @@ def check_stamp_unit(pairs: Sequence[ImagePair], folder: Path) -> None:
     if gap < _MIN_GAP:
         raise InputError(
             f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps to"
-            " seconds, or pass the frame rate with --fps if file names only look like timestamps"
+            f" seconds{other_fix}"
         )
     if gap > _MAX_GAP:
         raise InputError(
             f"{folder}: the images are {gap:g} s apart according to their timestamps; convert the timestamps to"
-            " seconds (they are probably in milliseconds or nanoseconds)"
+            f" seconds (they are probably in milliseconds or nanoseconds){other_fix}"
         )
 
 

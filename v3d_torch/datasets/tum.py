@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
-from kornia_rs import io
 from torch import Tensor
 
 from v3d_torch.datasets.cameras import CameraChoice, PublishedCamera
@@ -13,9 +13,11 @@ from v3d_torch.datasets.gravity_file import GRAVITY_FILE, read_gravity_file
 from v3d_torch.datasets.images import image_size
 from v3d_torch.datasets.lists import ImagePair, check_stamp_unit, pair_lists, read_associations
 from v3d_torch.datasets.paired_images import PairedImages
+from v3d_torch.datasets.png import decode_png
 from v3d_torch.datasets.sequence_names import folder_label
 from v3d_torch.datasets.tum_trajectory import read_groundtruth
 from v3d_torch.errors import InputError
+from v3d_torch.io.image_file import MAX_PIXELS
 
 
 class TUMSequence(PairedImages):
@@ -76,8 +78,10 @@ class TUMSequence(PairedImages):
             return None
         image_size(path)
         try:
-            ids = io.read_image_png_u8(str(path), "mono")
-        except Exception as error:  # kornia_rs raises bare Exception for every cause
+            ids = decode_png(path.read_bytes(), MAX_PIXELS)
+            if ids.dtype != np.uint8 or ids.shape[2] != 1:
+                raise ValueError("it is another kind of image")
+        except (OSError, ValueError) as error:
             raise InputError(
                 f"{path}: is truncated or not an 8-bit greyscale motion mask; copy it again, or rename the folder masks"
                 " if it contains something else"

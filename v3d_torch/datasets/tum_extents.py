@@ -1,4 +1,4 @@
-"""Extents of the sequences of the paper's evaluation, to recognise a part or another recording under their names."""
+"""Extents of TUM sequences, with those of the paper's evaluation, to recognise parts and other recordings."""
 
 from __future__ import annotations
 

@@ -35,8 +35,9 @@ _MIN_DECODED_FRACTION = 0.9
 The stated duration is approximate: OpenCV estimates the number of frames if the file does not store it.
 """
 
-_SAMPLED_FRAMES = 64
-"""Number of frames from which an unknown depth scale is estimated; all frames before a sampled one are decoded."""
+_SAMPLING_RANGE = 64
+"""Number of frames at the beginning from which samples are taken to estimate an unknown depth scale: all frames before
+a sample are decoded."""
 
 _SUFFIXES = frozenset({".mkv", ".mp4", ".avi", ".mov", ".webm", ".m4v"})
 
@@ -86,7 +87,7 @@ class VideoSequence(ImageSequence):
         self.pairing_note = pairing_note
         self._colour_frames = Cursor(partial(_open_frames, colour_path))
         self._depth_frames = Cursor(partial(_open_frames, depth_path, is_depth=True))
-        self._settle_depth_scale(path, _SAMPLED_FRAMES)
+        self._settle_depth_scale(path, _SAMPLING_RANGE)
 
     def frames_from(self, index: int) -> Iterator[RGBDFrame]:
         """Read the frames from ``index`` on, see `StoredSequence.frames_from`.
@@ -207,8 +208,13 @@ def _open_frames(path: Path, *, is_depth: bool = False) -> Iterator[cv2.VideoCap
     parameters = [cv2.CAP_PROP_N_THREADS, 1]
     if is_depth:  # by default OpenCV converts all videos to 8-bit colour
         parameters += [cv2.CAP_PROP_CONVERT_RGB, 0]
+    name = str(path.absolute())  # FFmpeg reads the relative name 10:30.avi as a protocol
+    try:
+        name.encode()
+    except UnicodeEncodeError as error:  # ends the process in OpenCV
+        raise InputError(f"{path}: has a name that is not UTF-8; rename the file and its folders") from error
     with _silence_opencv():
-        capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, parameters)
+        capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG, parameters)
     while capture.grab():
         yield capture
 

@@ -51,11 +51,13 @@ def write_colmap(
     tracks = replace(tracks, uv=camera.distort(tracks.uv))
     colours = torch.zeros(len(tracks.points), 3, dtype=torch.uint8)
     is_static = torch.zeros(len(tracks.uv), dtype=torch.bool)
+    # Features beside the border of a recorded image can be outside of the undistorted one.
+    is_inside = ((tracks.uv >= -0.5) & (tracks.uv <= torch.tensor([camera.width, camera.height]) - 0.5)).all(dim=1)
     image_lines, poses = [], []
     for index, image in enumerate(images):
         image.write_colour(folder / "images")
         image.write_mask(folder / "masks" / f"{image.name}.png")
-        observed = torch.nonzero(tracks.image == index)[:, 0]
+        observed = torch.nonzero((tracks.image == index) & is_inside)[:, 0]
         observed = observed[_values_at(image.static, tracks.uv[observed])]
         is_static[observed] = True
         colours[tracks.landmark[observed]] = _values_at(image.frame.image, tracks.uv[observed]).T

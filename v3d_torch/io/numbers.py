@@ -20,6 +20,7 @@ def parse_number(word: str) -> float:
     Raises:
         ValueError: If the word is not a number.
     """
-    if "_" in word or not word.isascii():  # Python's own numbers
+    # Python also accepts 1_000 and digits of other scripts; in a file they are damage.
+    if "_" in word or not word.isascii():
         raise ValueError(f"{word} is not a number")
     return float("nan") if _WINDOWS_NON_FINITE.fullmatch(word) else float(word)

@@ -63,7 +63,7 @@ def draw_objects_from_above(
     figure = Figure(figsize=(7.5, 6.5), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
-    background = points[:: max(1, len(points) // _MAX_POINTS)].to(torch.float64) @ R_lw.T
+    background = points[:: max(1, -(-len(points) // _MAX_POINTS))].to(torch.float64) @ R_lw.T
     x, y, _ = background.T.numpy()
     axes.scatter(x, y, s=0.3, color="#c8c8c8", linewidths=0, rasterized=True)
     path = (trajectory.T_wc[:, :3, 3] @ R_lw.T)[:, :2]

@@ -16,7 +16,7 @@ _HEIGHT_RANGE = 2.5
 
 
 def log_voxels(stream: rr.RecordingStream, occupancy: OccupancyMap) -> None:
-    """Log the occupied voxels, coloured by their height in the camera's first image.
+    """Log the occupied voxels, coloured by their height above the first camera, as if that camera had been level.
 
     Args:
         stream: Recording.
