@@ -314,6 +314,8 @@ def test_curves_summaries_and_events(recorded: tuple[Recording, RunLog, Pipeline
     recording, log, pipeline = recorded
     times = pipeline.record.times
     for stage, seconds in zip(times.stages, times.wall.T.tolist(), strict=True):
+        if stage == "viewer":  # it cannot show how long it takes
+            continue
         logged = recording.at(f"/seconds/{stage}")
         ran = [index for index, spent in enumerate(seconds) if spent]
         assert [logged[index]["scalars"][0] for index in ran] == pytest.approx([seconds[index] for index in ran])

@@ -198,9 +198,11 @@ class StaticMaskConfig(Section):
     paper masks persons until they are classified). Without usable depth, they stay masked."""
     hold_dynamic_time: float = Field(1.0, ge=0)
     """Time for which an object stays dynamic or deforming after the last evidence, seconds: a walking person pauses
-    between steps. A rigid object becomes static as soon as it is observed at rest."""
+    between steps. A rigid object becomes static as soon as it is observed at rest; if its features have shifted, it
+    stays dynamic until then."""
     confirm_dynamic_frames: int = Field(2, gt=0)
-    """Number of frames with evidence before a dynamic state is held: evidence in a single frame can be depth noise."""
+    """Number of frames with evidence within this time before a dynamic state is held: evidence in a single frame can be
+    depth noise."""
     dilation: int = Field(1, ge=0, le=100)
     """Dilation of masks regardless of depth, pixels: the alignment error of colour and depth. One more pixel takes
     a large part of the static pixels in a dense crowd."""

@@ -49,7 +49,7 @@ def as_words(descriptors: Tensor) -> NDArray[np.uint64]:
 
 def are_descriptors(*tensors: Tensor) -> bool:
     """Check whether all tensors have the type and shape of 256-bit descriptors."""
-    return all(tensor.dtype == torch.uint8 and tensor.shape[1:] == (32,) for tensor in tensors)
+    return all(tensor.dtype == torch.uint8 and tensor.shape[1:] == (_BYTES,) for tensor in tensors)
 
 
 def _match_descriptors_compiled(

@@ -1,4 +1,4 @@
-"""Checks of the arguments of the functions of tensors that cost no time: no check reads the values of a tensor."""
+"""Checks of the arguments of tensor functions. They take no time, because none reads the values of a tensor."""
 
 from __future__ import annotations
 

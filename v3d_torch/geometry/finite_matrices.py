@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def zero_if_not_finite(matrices: Tensor) -> tuple[Tensor, Tensor]:
-    """Replace matrices with NaN or infinity by 0, because torch decomposes none of a batch that contains one.
+    """Replace matrices with NaN or infinity by 0: torch raises an error for the whole batch if one is not finite.
 
     Args:
         matrices: Shape :math:`(..., n, n)`.

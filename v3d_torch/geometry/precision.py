@@ -23,7 +23,7 @@ def working_dtype(dtype: torch.dtype) -> torch.dtype:
 
 
 def result_dtype(dtype: torch.dtype) -> torch.dtype:
-    """Return the dtype of a function's results: that of its inputs, or float32 for integers, which cannot hold them.
+    """Return the dtype of a function's results: that of its inputs, or float32 for integers, which have no fractions.
 
     Args:
         dtype: Dtype of the inputs.

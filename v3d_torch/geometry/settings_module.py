@@ -12,8 +12,8 @@ from torch import Tensor
 class SettingsModule(torch.nn.Module):
     """Module with a setting for each parameter of its constructor, in an attribute of the same name.
 
-    A setting that is first set to a tensor, and no `torch.nn.Parameter`, is a buffer: ``to()`` moves it,
-    ``state_dict()`` has it, and only a tensor can replace it.
+    If the first value of a setting is a tensor, but no `torch.nn.Parameter`, the setting is a buffer: ``to()`` moves
+    it, ``state_dict()`` contains it, and later values must be tensors, too.
     """
 
     def __setattr__(self, name: str, value: Any) -> None:

@@ -85,7 +85,7 @@ def _transform_row(
 )
 def was_free(
     depth: Floats32, stride: int, rays: Floats, T_wc: Floats, T_cw: Floats, nearest_depth: Floats32,
-    intrinsics: Intrinsics, bounds: Bounds, limits: Limits, appeared: Floats,
+    intrinsics: Intrinsics, bounds: Bounds, limits: Limits, result: Floats,
 ) -> None:  # fmt: skip
     """Check whether the points of every n-th pixel lie in space that an earlier view observed as free.
 
@@ -99,11 +99,11 @@ def was_free(
         intrinsics: Intrinsics of the camera.
         bounds: Extent of the image.
         limits: Range of depths and tolerances.
-        appeared: 1 for free space, 0 for a surface, NaN if unknown, (h, w); written.
+        result: 1 for free space, 0 for a surface, NaN if unknown, (h, w); written.
     """
-    height, width = appeared.shape
+    height, width = result.shape
     in_view = np.empty((3, width))
     for row in range(height):
         row_rays = rays[:, row * width : (row + 1) * width]
         _transform_row(depth[row * stride], stride, row_rays, T_wc, T_cw, limits, in_view)
-        _compare(in_view, nearest_depth, intrinsics, bounds, limits, appeared[row])
+        _compare(in_view, nearest_depth, intrinsics, bounds, limits, result[row])

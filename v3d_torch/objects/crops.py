@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Crop = tuple[slice, slice]
-"""Rows and columns of a part of an image; those beyond its last ones do not count."""
+"""Rows and columns of a part of an image. They can end beyond the image; slices stop at its border."""
 
 
 def crop_around(mask: NDArray[np.uint8], margin: int, step: int = 1) -> Crop | None:

@@ -14,7 +14,7 @@ from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.objects.crops import crop_around
 
-_MAX_COMPILED_RADIUS = 254
+_MAX_COMPILED_RADIUS = 253
 """Maximum radius of the compiled dilation, pixels: the kernel stores distances up to the radius plus one as uint8."""
 
 
@@ -25,7 +25,7 @@ def ellipse(radius: int) -> NDArray[np.uint8]:
 
 
 def _dilate_compiled(mask: Tensor, pixels: int) -> Tensor:
-    if not 0 <= pixels < _MAX_COMPILED_RADIUS:
+    if not 0 <= pixels <= _MAX_COMPILED_RADIUS:
         return NotImplemented
     source = mask.view(torch.uint8).numpy()
     crop = crop_around(source, pixels)

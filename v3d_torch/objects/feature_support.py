@@ -1,7 +1,7 @@
 """Feature support of static objects: features on a static object fit the camera motion as well as other features.
 
 A person whose motion is not known yet is masked. But a segmentation network also labels rotated furniture as people,
-sometimes over most of the image, and then too few pixels remain for tracking. Features distinguish the two: few
+sometimes over most of the image, and then too few pixels remain for camera tracking. Features distinguish the two: few
 features on a walking person fit the camera motion.
 """
 

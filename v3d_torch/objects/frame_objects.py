@@ -17,8 +17,8 @@ class MotionState(StrEnum):
     """Motion state of an object."""
 
     STATIC = "static"
-    """At rest: tracking, landmarks and the occupancy map use its pixels. Point map and mesh use them unless it is a
-    person."""
+    """At rest: camera tracking, landmarks and the occupancy map use its pixels. Point map and mesh use them unless it
+    is a person."""
     DYNAMIC = "dynamic"
     """It moved recently: most of it is where an earlier view saw free space, or most of its former place is free now
     and enough objects vote for it, or its features moved against the camera motion."""
@@ -80,7 +80,7 @@ class FrameObjects:
 
     Attributes:
         objects: Objects, sorted by id.
-        static_mask: Pixels that tracking can use, bool, shape :math:`(H, W)`.
+        static_mask: Pixels that camera tracking can use, bool, shape :math:`(H, W)`.
         map_mask: Pixels of ``static_mask`` at a larger distance from excluded objects and from people, even
             static ones: for what is stored, such as point map, recordings and static surfaces; bool, shape
             :math:`(H, W)`.

@@ -47,7 +47,7 @@ _MIN_COVERED_FRACTION = 0.4
 
 _MAX_SHOWN_TIME = 0.1
 """A missed object is shown for this long, seconds: an object that is missed for longer is mostly hidden or has
-turned, so that its predicted mask is wrong. Tracking still leaves out the pixels of all predicted masks."""
+turned, so that its predicted mask is wrong. Camera tracking still leaves out the pixels of all predicted masks."""
 
 _MAX_OBSERVED_TIME = 0.2
 """Time before a frame for which the frame shows what was there, seconds: what happened in a longer gap is unknown."""
@@ -61,9 +61,9 @@ class InstanceTracker(torch.nn.Module):
     without a class, then those with one. An instance that was propagated continues its own track.
 
     If an object is not detected any more and may move, its mask is predicted for a short time. An object that does not
-    move has no mask in this time, because tracking uses its pixels; it is called resting. Afterwards both are lost:
-    confirmed ones keep their ids for some seconds, in case they were hidden or out of view. The state (tracks and next
-    id) is part of ``state_dict()``.
+    move has no mask in this time, because camera tracking uses its pixels; it is called resting. Afterwards both are
+    lost: confirmed ones keep their ids for some seconds, in case they were hidden or out of view. The state (tracks and
+    next id) is part of ``state_dict()``.
 
     Args:
         config: Gates and times.

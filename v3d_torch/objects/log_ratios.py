@@ -33,8 +33,8 @@ _OTHER_DISSIMILARITY = 0.21
 
 _SAMPLING_DISSIMILARITY = 0.6
 """Mean dissimilarity of two histograms of one person in consecutive frames, times the square root of the number of
-points of the smaller visible part: the fewer points, the more of them are on other objects. All means were measured on
-people with true masks."""
+points of the smaller visible part: a histogram of few points is a small sample of the colours. All means were measured
+on people with true masks."""
 
 _DISSIMILARITY_RATE, _CHANGING_TIME = 0.05, 1.5
 """Increase of this mean per second while a person turns, and the time after which it does not increase further."""
@@ -104,9 +104,9 @@ def appearance_log_ratio(similarity: Tensor, elapsed: Tensor, fewer: Tensor, mor
 
     Args:
         similarity: Similarity of the colour histograms, shape :math:`(*)`; NaN if one is unknown.
-        elapsed: Time between the two views, seconds, shape :math:`(*)`.
-        fewer: Number of points of the view that shows the smaller part of the object, shape :math:`(*)`.
-        more: Number of points of the other view, shape :math:`(*)`.
+        elapsed: Time between the two detections, seconds, shape :math:`(*)`.
+        fewer: Number of points of the smaller visible part of the object, shape :math:`(*)`.
+        more: Number of points of the larger one, shape :math:`(*)`.
 
     Returns:
         Log-likelihood ratio, shape :math:`(*)`; 0 if an appearance is unknown.

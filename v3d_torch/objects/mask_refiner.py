@@ -38,8 +38,9 @@ from v3d_torch.segmentation.coco import PERSON
 _INVERSE_DEPTH_TOLERANCE = 0.01
 """Tolerance of the inverse depth, 1/m: seven times the standard deviation of that of a structured-light camera."""
 
-_MIN_PART_RADIUS = 8
-"""Minimum radius of a part of the network's mask that is kept beside the object's surface, pixels."""
+_MIN_PART_RADIUS, _MIN_COARSE_RADIUS = 8, 2
+"""Minimum radius of a part of the network's mask that is kept beside the object's surface, pixels and coarse pixels: in
+large images, the errors of the network's contour are larger."""
 
 
 class RefinedMask(NamedTuple):
@@ -229,8 +230,8 @@ def _dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
 
 
 def _wide_parts(cells: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:
-    """Remove narrow parts from cells of the network's mask, (h, w): they are background along its coarse contour."""
-    kernel = ellipse(max(_MIN_PART_RADIUS // stride, 1))
+    """Remove narrow parts from coarse pixels of the network's mask, (h, w): they are background along its contour."""
+    kernel = ellipse(max(_MIN_PART_RADIUS // stride, _MIN_COARSE_RADIUS))
     return cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_OPEN, kernel).view(np.bool_)
 
 

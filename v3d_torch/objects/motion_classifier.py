@@ -93,7 +93,7 @@ class MotionClassifier(StatefulComponent):
                 track.motion.mark_at_rest()
 
         # Masks, refined by depth, and the positions that they show.
-        excluded = [track for track in tracks if not self._is_trackable(motion_states[track])]
+        excluded = [track for track in tracks if not self._is_usable_for_camera(motion_states[track])]
         refined = self._refine_masks(excluded, tracks, view, appeared_pixels)
         size = view.missing.shape
         masks = static_masks([refined[track] for track in excluded], list(refined.values()), size, config)
@@ -274,8 +274,8 @@ class MotionClassifier(StatefulComponent):
         flags = zip(tracks, have_most_inliers.tolist(), strict=True)
         return {track for track, has_most in flags if has_most and track.is_rigid}
 
-    def _is_trackable(self, motion_state: MotionState) -> bool:
-        """Check whether tracking can use the pixels of an object with this motion state."""
+    def _is_usable_for_camera(self, motion_state: MotionState) -> bool:
+        """Check whether camera tracking can use the pixels of an object with this motion state."""
         deforming = motion_state is MotionState.DEFORMING and self._config.chamfer.keep_deforming_features
         return deforming or motion_state is MotionState.STATIC
 

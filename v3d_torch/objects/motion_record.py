@@ -13,6 +13,13 @@ _MIN_SHIFT_TIME = 1 / 3
 be matched wrongly, on a repeated pattern."""
 
 
+_MAX_INTERVAL = 1.0
+"""Maximum time between two frames whose shifts are added up, seconds."""
+
+_COUNTED_FRAMES = 100
+"""Number of frames with a motion whose times are kept: more than any configuration needs to confirm a motion."""
+
+
 @dataclass
 class MotionRecord:
     """Times at which there was evidence that an object moves or is at rest.
@@ -34,6 +41,7 @@ class MotionRecord:
     last_deforming: float = -inf
     supported_since: float = inf
     _shifts: list[tuple[float, FeatureShift]] = field(default_factory=list)  # by the time of the frame
+    _dynamic_stamps: list[float] = field(default_factory=list)  # of the last frames that showed a motion
 
     @property
     def has_moved(self) -> bool:
@@ -44,6 +52,11 @@ class MotionRecord:
         """Record that the frame at ``stamp``, seconds, shows a motion of the object."""
         self.last_dynamic = stamp
         self.dynamic_frames += 1
+        self._dynamic_stamps = [*self._dynamic_stamps[1 - _COUNTED_FRAMES :], stamp]
+
+    def count_dynamic_frames(self, since: float) -> int:
+        """Count the frames since a time, seconds, that show a motion of the object; only the last 100 are known."""
+        return sum(each >= since for each in self._dynamic_stamps)
 
     def mark_deforming(self, stamp: float) -> None:
         """Record that the object deforms in the frame at ``stamp``, seconds."""
@@ -61,7 +74,10 @@ class MotionRecord:
             shift: Shift since the previous frame; None if it is not known.
             time_span: Time over which shifts are added up, seconds.
         """
-        self._shifts = [each for each in self._shifts if stamp - each[0] < time_span + STAMP_TOLERANCE]
+        # The last shift is kept for longer, so that there are two at a low frame rate.
+        recent = [each for each in self._shifts[:-1] if stamp - each[0] < time_span + STAMP_TOLERANCE]
+        last = [each for each in self._shifts[-1:] if stamp - each[0] < max(time_span, _MAX_INTERVAL) + STAMP_TOLERANCE]
+        self._shifts = recent + last
         if shift is None:
             return
         self._shifts.append((stamp, shift))

@@ -18,6 +18,10 @@ _MIN_MISSED_SCORE = 0.3
 """A missed object that was never dynamic is masked only if the scores of its detections add up to this, two weak ones
 or one strong one: the network labels rotated furniture as people in single frames."""
 
+_MAX_UNKNOWN_TIME = 5.0
+"""A thing that was pushed counts as moving for at most this long, seconds, if the free-space check does not know its
+surface."""
+
 _MIN_SUPPORTED_TIME = 0.3
 """The features on a static object fit the camera motion for at least this long, seconds. Between two frames those on a
 person fit it too, if the person walks slowly or along the line of sight."""
@@ -42,15 +46,16 @@ def decide_motion_state(
         return MotionState.DYNAMIC
     at_rest = [fraction < _STATIC_FRACTION for fraction in appeared_fractions]
     at_rest_over_all = len(at_rest) > 0 and all(at_rest)
-    rarely_detected = track.total_score < _MIN_MISSED_SCORE and not motion.has_moved
-    if track.missed and (at_rest_over_all or rarely_detected):
+    weakly_detected = track.total_score < _MIN_MISSED_SCORE and not motion.has_moved
+    if track.missed and (at_rest_over_all or weakly_detected):
         return MotionState.STATIC
     # A walking person pauses, but a rigid thing that is at rest over all known time spans has stopped.
     known = [rest for rest, fraction in zip(at_rest, appeared_fractions, strict=True) if not isnan(fraction)]
     if track.has_rigid_label and known and all(known):
         return MotionState.STATIC
     # Features of a masked object are not matched, so that they cannot show that it still moves.
-    is_shifting = track.has_rigid_label and motion.is_shifting
+    is_observed = len(known) > 0 or stamp - motion.last_shifted <= _MAX_UNKNOWN_TIME
+    is_shifting = track.has_rigid_label and motion.is_shifting and len(appeared_fractions) > 0 and is_observed
     if is_shifting or is_held_dynamic(track, stamp, config):
         return MotionState.DYNAMIC
     if stamp - motion.last_deforming <= config.hold_dynamic_time:
@@ -72,5 +77,6 @@ def is_held_dynamic(track: Track, stamp: float, config: StaticMaskConfig) -> boo
         config: Times for which evidence counts.
     """
     motion = track.motion
-    is_recent = stamp - motion.last_dynamic <= config.hold_dynamic_time
-    return (is_recent and motion.dynamic_frames >= config.confirm_dynamic_frames) or motion.last_dynamic == stamp
+    hold = config.hold_dynamic_time
+    is_confirmed = motion.count_dynamic_frames(motion.last_dynamic - hold) >= config.confirm_dynamic_frames
+    return (stamp - motion.last_dynamic <= hold and is_confirmed) or motion.last_dynamic == stamp

@@ -232,7 +232,7 @@ class Silhouette:
         return 0 if len(self._z) == 0 else int((self._measured_depth(depth) - self._z > DEPTH_TOLERANCE).sum())
 
     def _measured_depth(self, depth: Tensor) -> NDArray[np.float32]:
-        """Return the measured depth at each projected point, metres, shape (P,)."""
+        """Return the measured depth at the centre of the cell of each projected point, metres, shape (P,)."""
         _, height, width = depth.shape
         u, v = np.minimum(CELL_SIZE * self._cells + CELL_SIZE // 2, (width - 1, height - 1)).T
         return depth[0].numpy()[v, u]

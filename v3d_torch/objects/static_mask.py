@@ -1,4 +1,4 @@
-"""Static mask: pixels of a frame that tracking can use, and those of them that maps can use."""
+"""Static mask: pixels of a frame that camera tracking can use, and those of them that maps can use."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class StaticMasks(NamedTuple):
 def static_masks(
     excluded: Sequence[RefinedMask], all_masks: Sequence[RefinedMask], size: torch.Size, config: StaticMaskConfig
 ) -> StaticMasks:
-    """Compute the pixels that tracking can use, and those of them that can be stored in maps.
+    """Compute the pixels that camera tracking can use, and those of them that can be stored in maps.
 
     Args:
-        excluded: Masks of the objects that tracking must not use.
+        excluded: Masks of the objects that camera tracking must not use.
         all_masks: These masks, and those of the other people.
         size: Height and width of the image.
         config: Margins of the masks.

@@ -42,7 +42,7 @@ _CONFIRMING_DYNAMIC_FRAMES = 2
 """Number of frames with evidence of an object's motion that confirm it, whatever its scores."""
 
 _APPEARANCE_RATE = 0.1
-"""Weight of the newest colour histogram in the mean of a track: some tenths of a second at 30 Hz."""
+"""Weight of the newest colour histogram in the mean of a track, which is that of some ten detections."""
 
 _DETECTION_TIME = 1.0
 """Detections are kept for this long, and one before, seconds: the longest time span of the vote. It bounds memory."""
@@ -141,8 +141,8 @@ class Track:
     @property
     def is_confirmed(self) -> bool:
         """True if scores or motion have shown that the object exists."""
-        has_moved = self.motion.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
-        return has_moved or self.total_score >= _MIN_CONFIRMED_SCORE
+        moved_repeatedly = self.motion.dynamic_frames >= _CONFIRMING_DYNAMIC_FRAMES
+        return moved_repeatedly or self.total_score >= _MIN_CONFIRMED_SCORE
 
     @property
     def may_move(self) -> bool:
@@ -310,6 +310,7 @@ class Track:
         self.first_stamp = stamp
         self.motion.restart()
         self.detections = []
+        self._filter = ConstantVelocityKalmanFilter(self._config)
 
     def update_label(self, label: int, score: float) -> None:
         """Update the class with the class of a detection.
@@ -364,7 +365,8 @@ class Track:
         """
         self.history = [state.transform(T_new_old) if state.stamp >= since else state for state in self.history]
         self.detections = [d.transform(T_new_old) if d.stamp >= since else d for d in self.detections]
-        if since == -torch.inf:
+        has_centroid = any(each.has_centroid for each in self.detections if each.stamp >= since)
+        if since == -torch.inf or not has_centroid:
             self._filter.apply_world_correction(T_new_old)
         elif self._filter.state.stamp >= since:  # the state combines measurements in both world frames
             shown = self._filter.visible_state.transform(T_new_old)

@@ -152,7 +152,8 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
 
     An instance can continue a track of its class if it lies within the gate or covers the predicted mask. It can
     continue a track of any class if it overlaps the last or the predicted mask, because the position jumps when an
-    object is partly hidden. An instance that does not overlap the predicted mask of a visible track is another object.
+    object is partly hidden. By its position alone, an instance that does not overlap the predicted mask of a visible
+    track does not continue it.
 
     Args:
         predicted: T tracks.
@@ -195,8 +196,8 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
 def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
     """Add up the log-likelihood ratios of each pair of a track without a predicted mask and an instance.
 
-    The size of a track's view, for the log ratio of appearances, is the mean over its views: the last view of an object
-    that left the image is small.
+    The size of the visible part of a track, for the log ratio of appearances, is the mean over its detections: the last
+    visible part of an object that left the image is small.
 
     Args:
         tracks: T tracks.

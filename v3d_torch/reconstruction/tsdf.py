@@ -38,7 +38,7 @@ def surface_blocks(views: StaticViews, config: DenseMapConfig) -> Tensor:
         Unique block coordinates in ascending order, int64, shape :math:`(N, 3)`.
     """
     side = BLOCK * config.mesh.voxel_size
-    # Steps along a ray of at most one block, so that no block between them is missed.
+    # Steps along a ray of at most one block: a block is missed only where a ray cuts one of its edges.
     steps = torch.linspace(-1, 1, 2 * math.ceil(config.mesh.truncation / side) + 1, dtype=torch.float64)
     found = [torch.zeros(0, dtype=torch.int64)]
     for view in views:

@@ -43,7 +43,9 @@ class YOLOSegmenter:
         weights = None if weights is None else Path(weights)
         if weights is not None and weights.suffix.lower() == ".onnx":
             self._network: WholeNetwork | SplitNetwork = WholeNetwork(weights, config.threads)
+            one_to_one = False  # what the user's own network predicts is not known
         else:
+            one_to_one = REGISTRY[config.model].one_to_one
             path = exported_path(config.model, find_weights(config.model, weights), config.height, config.width)
             if config.precision == "int8" and has_int8_instructions():
                 path = quantised_path(path)
@@ -51,7 +53,7 @@ class YOLOSegmenter:
         self.config = config
         self.height, self.width = self._network.height, self._network.width
         self._weights = weights
-        self._iou_threshold = None if REGISTRY[config.model].one_to_one else config.iou_threshold
+        self._iou_threshold = None if one_to_one else config.iou_threshold
 
     def __reduce__(self) -> tuple[type[YOLOSegmenter], tuple[SegmentationConfig, Path | None]]:
         """Pickle by configuration and path, because sessions cannot be pickled: the other process reopens the files."""
