@@ -127,9 +127,14 @@ def data_root_of(name: str, data_root: Path | None) -> Path | None:
     return None if data_root is None else data_root.absolute()
 
 
+def is_live(name: str) -> bool:
+    """Check whether a name is that of a live camera."""
+    return name.partition(":")[0] == "realsense"
+
+
 def _is_special(name: str) -> bool:
     """Check whether a name is empty or that of a source that is not on disk."""
-    return name in ("", *BUILT_IN_SEQUENCES) or name.partition(":")[0] == "realsense"
+    return name in ("", *BUILT_IN_SEQUENCES) or is_live(name)
 
 
 def _find(root: Path, name: str, full_name: str | None) -> Path | None:

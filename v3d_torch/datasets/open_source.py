@@ -10,7 +10,7 @@ from pathlib import Path
 from v3d_torch.datasets.base import RGBDSequence, RGBDStream
 from v3d_torch.datasets.cameras import CameraChoice
 from v3d_torch.datasets.image_sequence import ImageSequence
-from v3d_torch.datasets.locate import find_or_download
+from v3d_torch.datasets.locate import find_or_download, is_live
 from v3d_torch.datasets.realsense import open_realsense_camera
 from v3d_torch.datasets.sequence_names import BUILT_IN_SEQUENCES
 from v3d_torch.datasets.sources import SourceOptions, open_path, reject_options
@@ -94,11 +94,6 @@ def load_sequence(
             f" v3d-torch record --seq {shlex.quote(str(name))} --out FOLDER"
         )
     return source
-
-
-def is_live(name: str) -> bool:
-    """Check whether a name is that of a live camera."""
-    return name.partition(":")[0] == "realsense"
 
 
 def _open(

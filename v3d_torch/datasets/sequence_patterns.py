@@ -20,7 +20,7 @@ _NAMED_FOLDERS = 3
 
 
 @dataclass(frozen=True)
-class Matches:
+class MatchedSequences:
     """Sequences and other folders that names, paths and patterns match.
 
     Attributes:
@@ -46,7 +46,7 @@ class Matches:
         return notes
 
 
-def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -> Matches:
+def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -> MatchedSequences:
     """Find the sequences that match names, paths and patterns.
 
     The wildcards are those of the shell, ``*``, ``?`` and ``[ ]``. A pattern is matched against
@@ -82,7 +82,7 @@ def matching_sequences(patterns: Iterable[str], data_root: Path | None = None) -
             raise InputError(f"{pattern}: is not a valid pattern ({error}); check the path") from error
         if folders:
             other_folders[pattern] = folders
-    return Matches(list(sequences.values()), other_folders)
+    return MatchedSequences(list(sequences.values()), other_folders)
 
 
 def _match(pattern: str, root: Path) -> tuple[list[str], list[str]]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from v3d_torch.datasets import RGBDSequence, RGBDStream
-from v3d_torch.datasets.open_source import is_live
+from v3d_torch.datasets.locate import is_live
 from v3d_torch.datasets.sequence_digest import sequence_digest
 from v3d_torch.errors import InputError
 from v3d_torch.export.posed_image import PosedImage

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from v3d_torch.datasets.gravity import gravity_direction
+from v3d_torch.datasets.ros.bag_stamps import header_stamp
 from v3d_torch.datasets.ros.bag_topics import shared_parts
 
 _LOG = logging.getLogger(__name__)
@@ -75,8 +76,7 @@ def _read_accelerations(
     """Read the frame and the accelerations, shape (N, 3), around the first image."""
     frame, accelerations = "", [np.zeros((0, 3))]
     for _, _, message in messages:
-        time = message.header.stamp
-        since = time.sec + time.nanosec * 1e-9 - first_stamp
+        since = header_stamp(message) - first_stamp
         if since > _AFTER:
             break
         if since >= -_BEFORE:

@@ -19,7 +19,7 @@ from v3d_torch.datasets.image_sequence import ImageSequence
 from v3d_torch.datasets.lists import MAX_STAMP_DIFFERENCE, note_unpaired
 from v3d_torch.datasets.ros.bag_gravity import TRANSFORMS, read_gravity
 from v3d_torch.datasets.ros.bag_images import decode_colour_message, decode_depth_message
-from v3d_torch.datasets.ros.bag_stamps import index_by_stamp
+from v3d_torch.datasets.ros.bag_stamps import header_stamp, index_by_stamp
 from v3d_torch.datasets.ros.bag_topics import BagTopics, choose_topics
 from v3d_torch.datasets.ros.camera_info import camera_from_info, fields_of_info
 from v3d_torch.errors import InputError
@@ -220,8 +220,7 @@ def _index_messages(
                 if fields not in [known for _, known in cameras]:
                     cameras.append((arrival * 1e-9, fields))
             continue
-        stamp = message.header.stamp
-        stamps[topic].append(stamp.sec + stamp.nanosec * 1e-9)
+        stamps[topic].append(header_stamp(message))
         arrivals[topic].append(arrival * 1e-9)
         frame_ids[topic] = frame_ids[topic] or message.header.frame_id.strip("/")
         if progress is not None:

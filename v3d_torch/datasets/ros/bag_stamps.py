@@ -1,10 +1,11 @@
-"""Stamps of the images of a topic: those of their headers, in increasing order."""
+"""Stamps of the messages of a topic: those of their headers, in increasing order."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from v3d_torch.errors import InputError
 
@@ -55,3 +56,9 @@ def index_by_stamp(
             " again with a clock that is not set"
         )
     return indices, f"{topic}: {jump}; {count} are left out"
+
+
+def header_stamp(message: Any) -> float:
+    """Return the stamp in the header of a message, seconds."""
+    stamp = message.header.stamp
+    return float(stamp.sec + stamp.nanosec * 1e-9)
