@@ -231,7 +231,7 @@ CASES = [
         "distortion that cannot be inverted",
         edit(YAML, lambda content: content + b"distortion: [-50, 0, 0, 0, 0]\n"),
         Fails(
-            "{seq}: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
+            "{seq}/camera.yaml: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
             " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
@@ -239,7 +239,7 @@ CASES = [
         "huge distortion",
         edit(YAML, lambda content: content + b"distortion: [1e30, 1e30, 1e30, 1e30, 1e30]\n"),
         Fails(
-            "{seq}: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image corners;"
+            "{seq}/camera.yaml: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image corners;"
             " correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
