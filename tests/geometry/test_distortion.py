@@ -106,13 +106,13 @@ def test_undistorted_bounds_contain_all_undistorted_pixels() -> None:
     u_min, v_min, u_max, v_max = BROWN.undistorted_bounds
     u, v = BROWN.undistort(corners).unbind(dim=1)
     assert u_min < u.min() and v_min < v.min() and u.max() < u_max and v.max() < v_max
-    assert PinholeCamera(300.0, 300.0, 319.5, 239.5, 640, 480).undistorted_bounds == (-0.5, -0.5, 639.5, 479.5)
+    assert PinholeCamera(300.0, 300.0, 319.5, 239.5, 640, 480).undistorted_bounds == (0, 0, 640, 480)
 
 
 def test_undistorted_bounds_contain_the_image_of_a_lens_that_shrinks_it() -> None:
     camera = PinholeCamera(517.3, 516.5, 318.6, 255.3, distortion=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
     assert camera.undistort(torch.zeros(1, 2)).min() > 4
-    assert camera.undistorted_bounds == (-0.5, -0.5, 639.5, 479.5)
+    assert camera.undistorted_bounds == (0, 0, 640, 480)
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ def board_in_left_half(distance: float) -> Tensor:
 
 
 def in_image(pixels: Tensor) -> Tensor:
-    return ((pixels >= -0.5) & (pixels < torch.tensor([640, 480]) - 0.5)).all(dim=1)
+    return ((pixels >= 0) & (pixels < torch.tensor([640, 480]))).all(dim=1)
 
 
 def test_pose_and_landmarks_are_found_from_an_inexact_prediction() -> None:

@@ -252,15 +252,14 @@ class PinholeCamera:
     def undistorted_bounds(self) -> tuple[float, float, float, float]:
         """Extent of the image and its undistorted pixels: minimum u and v, inclusive, and maximum u and v, exclusive.
 
-        Pixel centres are at integers, so that an image begins at -0.5. The undistorted image of a wide lens is much
-        larger than the recorded image. Where it is smaller, predicted positions between the two borders count as in the
-        image, because predictions have errors.
+        The undistorted image of a wide lens is much larger than the recorded image. Where it is smaller, predicted
+        positions between the two borders count as in the image, because predictions have errors.
         """
-        begin, right, bottom = -0.5, self.width - 0.5, self.height - 0.5
+        width, height = float(self.width), float(self.height)
         if not self.is_distorted:
-            return begin, begin, right, bottom
+            return 0.0, 0.0, width, height
         low, high = (self._normalised_bounds * self.focal_lengths + self._principal_point).tolist()
-        return min(low[0], begin), min(low[1], begin), max(high[0], right), max(high[1], bottom)
+        return min(low[0], 0.0), min(low[1], 0.0), max(high[0], width), max(high[1], height)
 
     def project_to_image(self, points: Tensor, min_depth: float) -> tuple[Tensor, Tensor]:
         """Project points to distorted pixels and check which of them lie in the image.

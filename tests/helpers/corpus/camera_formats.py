@@ -142,8 +142,8 @@ CASES = [
         "fisheye of more than 170 degrees",
         all_of(field("fx", "20"), append("distortion_model: equidistant\n")),
         Fails(
-            "{seq}/camera.yaml: the distortion (0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct the camera's"
-            " distortion (k1, k2, k3, k4), or crop the images to less than 170 degrees"
+            "{seq}/camera.yaml: the distortion (0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
+            " the camera's distortion (k1, k2, k3, k4), or crop the images to less than 170 degrees"
         ),
     ),
 ]

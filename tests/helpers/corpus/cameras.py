@@ -231,16 +231,16 @@ CASES = [
         "distortion that cannot be inverted",
         edit(YAML, lambda content: content + b"distortion: [-50, 0, 0, 0, 0]\n"),
         Fails(
-            "{seq}/camera.yaml: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners; correct"
-            " the camera's distortion (k1, k2, p1, p2, k3) or remove it"
+            "{seq}/camera.yaml: the distortion (-50.0, 0.0, 0.0, 0.0, 0.0) cannot be inverted at the image corners;"
+            " correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
     Case(
         "huge distortion",
         edit(YAML, lambda content: content + b"distortion: [1e30, 1e30, 1e30, 1e30, 1e30]\n"),
         Fails(
-            "{seq}/camera.yaml: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image corners;"
-            " correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
+            "{seq}/camera.yaml: the distortion (1e+30, 1e+30, 1e+30, 1e+30, 1e+30) cannot be inverted at the image"
+            " corners; correct the camera's distortion (k1, k2, p1, p2, k3) or remove it"
         ),
     ),
     Case(
