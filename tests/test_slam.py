@@ -280,6 +280,15 @@ def test_previous_frame_is_refined_before_a_frame_is_tracked(demo: RGBDSequence)
     assert calls == ["nothing", "track", "refine 0", "track", "refine 1", "track"]
 
 
+def test_both_images_are_simultaneous_without_time_compensation(demo: RGBDSequence) -> None:
+    """The delay moved the depth of the free-space check and of the maps, although the option was off."""
+    config = load_config(overrides=["rolling_shutter.enabled=false"])
+    slam = V3DSLAM(demo.camera, NoSegmentation(), config)
+    for index in range(3):
+        result = slam(replace(demo[index], depth_delay=0.012))
+    assert torch.equal(result.T_dc, torch.eye(4, dtype=torch.float64))
+
+
 @pytest.mark.parametrize("by_stamps", [0.012, 0.005, 0.0])
 def test_free_space_is_checked_with_the_pose_at_the_time_of_the_depth_image(
     by_stamps: float, demo: RGBDSequence

@@ -268,7 +268,7 @@ class V3DSLAM(FramePreprocessor):
             motion = self.odometry(self._previous, TrackedFrame(frame, depth, features), T_cp, velocity)
             self.states.append_motion(frame.stamp, motion)  # for `pose_at` in other threads
         is_delayed = self.config.rolling_shutter.enabled  # else colour and depth count as simultaneous
-        delay = is_delayed * (frame.depth_delay + self.camera.depth_delay)
+        delay = frame.depth_delay + self.camera.depth_delay if is_delayed else 0.0
         T_dc = se3_exp(motion.velocity * delay)  # from the time of the colour image to that of the depth image
         objects, view = self._track_objects(preprocessed, features, motion, T_dc)  # III-A to III-D
         self.flush()  # III-E: bundle adjustment, loops and pose graph, solved since the last keyframe

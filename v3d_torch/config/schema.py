@@ -200,7 +200,7 @@ class StaticMaskConfig(Section):
     """Time for which an object stays dynamic or deforming after the last evidence, seconds: a walking person pauses
     between steps. A rigid object becomes static as soon as it is observed at rest; if its features have shifted, it
     stays dynamic until then."""
-    confirm_dynamic_frames: int = Field(2, gt=0)
+    confirm_dynamic_frames: int = Field(2, gt=0, le=100)
     """Number of frames with evidence within this time before a dynamic state is held: evidence in a single frame can be
     depth noise."""
     dilation: int = Field(1, ge=0, le=100)

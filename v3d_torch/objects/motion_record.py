@@ -17,7 +17,7 @@ _MAX_INTERVAL = 1.0
 """Maximum time between two frames whose shifts are added up, seconds."""
 
 _COUNTED_FRAMES = 100
-"""Number of frames with a motion whose times are kept: more than any configuration needs to confirm a motion."""
+"""Number of frames with a motion whose times are kept: the maximum of ``static_mask.confirm_dynamic_frames``."""
 
 
 @dataclass

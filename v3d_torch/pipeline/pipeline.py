@@ -219,6 +219,7 @@ class Pipeline:
             with closing(iter(live)) as results:
                 for result in results:
                     self.between_frames = False
+                    self.record.rejected = live.rejected
                     yield result.frame, result
         finally:
             self.record.rejected = live.rejected  # also if no frame was tracked after the last rejected one
