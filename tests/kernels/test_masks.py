@@ -45,12 +45,22 @@ def test_filled_surfaces_equal_their_twin(density: float, step: int) -> None:
     assert torch.equal(found, expected)
 
 
-@pytest.mark.parametrize("count", [1, 2, 500])
-def test_binned_depths_equal_their_twin(count: int) -> None:
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("filled", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("radius", [0, 1, 3, 8, 20])
+def test_minima_around_cells_equal_their_twin(size: tuple[int, int], filled: float, radius: int) -> None:
     rng = np.random.default_rng(0)
-    cells, z = rng.integers(-3, 9, (count, 2)), rng.uniform(0.5, 5, count).astype(np.float32)
-    for found, expected in zip(*(f(cells, z) for f in TWINS[f"{silhouette.__name__}._bin_depths"]), strict=True):
-        np.testing.assert_array_equal(found, expected)
+    minima = np.where(rng.random((*size, 1)) < filled, rng.normal(0, 2, (*size, 2)), 1e6).astype(np.float32)
+    found, expected = (f(minima, radius) for f in TWINS[f"{silhouette.__name__}._minima_around"])
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.parametrize("count", [0, 1, 500])
+def test_counted_points_equal_their_twin(count: int) -> None:
+    rng, depth = np.random.default_rng(0), random_depth((47, 62), 0.8)
+    cells, z = rng.integers(0, (16, 12), (count, 2)), rng.normal(2, 0.2, count).astype(np.float32)
+    found, expected = (f(cells, z, depth, 0.2) for f in TWINS[f"{silhouette.__name__}._count_points"])
+    assert found == expected
 
 
 @pytest.mark.parametrize("step", [1, 3, 4])
@@ -63,8 +73,7 @@ def test_selected_pixels_equal_their_twin(step: int, first: tuple[int, int], inc
     minima = np.stack([nearest, -farthest], axis=-1).astype(np.float32)
     depth = random_depth((48, 64), 0.8)[:, ::step, ::step]
     found, expected = (
-        f(minima, np.array(first), depth, 0.2, step, include_missing)
-        for f in TWINS[f"{silhouette.__name__}._select_pixels"]
+        f(minima, first, depth, 0.2, step, include_missing) for f in TWINS[f"{silhouette.__name__}._select_pixels"]
     )
     assert torch.equal(found, expected)
 
@@ -78,15 +87,15 @@ def test_selected_pixels_equal_their_twin(step: int, first: tuple[int, int], inc
         ((-0.01, 0.02, -0.01, 0.002), "equidistant"),
     ],
 )
-def test_projected_cells_equal_their_twin(distortion: tuple[float, ...], model: DistortionModel) -> None:
+def test_projected_cloud_equals_its_twin(distortion: tuple[float, ...], model: DistortionModel) -> None:
     camera = PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=distortion, distortion_model=model)
     rng = np.random.default_rng(0)
     clouds = [torch.from_numpy(rng.normal(0, 2, (count, 3))) for count in (0, 1, 1000)]
     clouds.append(torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [torch.nan, 0.0, 1.0]], dtype=torch.float64))
-    found, expected = (f(clouds, camera) for f in TWINS[f"{silhouette.__name__}._project_to_cells"])
-    for (cells, z), (expected_cells, expected_z) in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(cells, expected_cells)
-        np.testing.assert_array_equal(z, expected_z)
+    for cloud in clouds:
+        found, expected = (f(cloud, camera) for f in TWINS[f"{silhouette.__name__}._project"])
+        for each, expected_each in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(each, expected_each)
 
 
 def random_depth(size: tuple[int, int], measured: float) -> torch.Tensor:

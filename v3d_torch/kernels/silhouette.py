@@ -6,60 +6,91 @@ import math
 
 import numpy as np
 
-from v3d_torch.kernels.arrays import Bools, Floats, Floats32, Ints
+from v3d_torch.kernels.arrays import Bools, Bytes, Floats, Floats32, Ints
 from v3d_torch.kernels.camera import Bounds, Intrinsics, project_to_image
 from v3d_torch.kernels.compiler import device, kernel
 
 
-@kernel("(f8[:,:], f8, i8, UniTuple(f8, 13), UniTuple(f8, 6))")
+@device
+def _bin_depths(cells: Ints, z: Floats32, first: tuple[int, int], size: tuple[int, int], no_depth: float) -> Floats32:
+    """Minimum of z and of -z of the points in each cell from the first one on, (rows, columns, 2)."""
+    minima = np.full((size[1], size[0], 2), no_depth, np.float32)
+    for i in range(len(cells)):
+        cell = minima[cells[i, 1] - first[1], cells[i, 0] - first[0]]
+        cell[0], cell[1] = min(cell[0], z[i]), min(cell[1], -z[i])
+    return minima
+
+
+@kernel("(f8[:,:], f8, i8, f4, UniTuple(f8, 13), UniTuple(f8, 6))")
 def project_to_cells(
-    points: Floats, min_depth: float, cell: int, intrinsics: Intrinsics, bounds: Bounds
-) -> tuple[Ints, Floats32]:
+    points: Floats, min_depth: float, cell: int, no_depth: float, intrinsics: Intrinsics, bounds: Bounds
+) -> tuple[Ints, Floats32, Floats32, tuple[int, int], float]:
     """Project a cloud to square cells of an image.
 
     Args:
         points: Points, camera frame, metres, (P, 3), in any memory order.
         min_depth: Points with at most this depth are not projected, metres.
         cell: Side of the cells, pixels.
+        no_depth: Depth of cells without points, metres.
         intrinsics: Intrinsics of the camera.
         bounds: Extent of the image.
 
     Returns:
-        Cell (column, row), (Q, 2), and depth, metres, (Q,), of the points in the image.
+        Cell (column, row), (Q, 2), and depth, metres, (Q,), of the points in the image; minimum of z and of -z in each
+        cell from the first one on, (rows, columns, 2); first cell (column, row); median depth. No cell, and 0, without
+        a point in the image.
     """
     cells, depths, count = np.empty((len(points), 2), np.int64), np.empty(len(points), np.float32), 0
+    left, top, right, bottom = 0, 0, -1, -1
     for i in range(len(points)):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         inside, u, v = project_to_image(x, y, z, min_depth, intrinsics, bounds)
         if inside:
             # Pixel centres lie at integers, so a cell begins half a pixel before its first pixel centre.
-            cells[count, 0], cells[count, 1] = math.floor((u + 0.5) / cell), math.floor((v + 0.5) / cell)
-            depths[count] = z
+            column, row = math.floor((u + 0.5) / cell), math.floor((v + 0.5) / cell)
+            if count == 0:
+                left, top, right, bottom = column, row, column, row
+            left, top, right, bottom = min(left, column), min(top, row), max(right, column), max(bottom, row)
+            cells[count, 0], cells[count, 1], depths[count] = column, row, z
             count += 1
-    return cells[:count], depths[:count]
+    cells, depths, first = cells[:count], depths[:count], (left, top)
+    minima = _bin_depths(cells, depths, first, (right - left + 1, bottom - top + 1), no_depth)
+    median = float(np.partition(depths, count // 2)[count // 2]) if count else 0.0
+    return cells, depths, minima, first, median
 
 
-@kernel("(i8[:,::1], f4[::1], f4)")
-def bin_depths(cells: Ints, z: Floats32, no_depth: float) -> tuple[Ints, Floats32]:
-    """Minimum and maximum depth of the points in each cell.
+@device
+def _lower(values: Floats32, minimum: Floats32) -> None:
+    for x in range(minimum.size):
+        minimum[x] = values[x] if values[x] < minimum[x] else minimum[x]
+
+
+@kernel("(f4[:,:,::1], u1[::1], f4)")
+def minima_around(minima: Floats32, heights: Bytes, no_depth: float) -> Floats32:
+    """Minima in a convex, symmetric shape around each cell, also around the empty cells beside the given ones.
 
     Args:
-        cells: Cell (column, row) of each point, (Q, 2), at least one point.
-        z: Depth of each point, metres, (Q,).
-        no_depth: Depth of cells without points, metres.
+        minima: Minimum of z and of -z in each cell, metres, (rows, columns, 2).
+        heights: Height of the shape above its centre, in each column from the centre to the right, cells, (r + 1,).
+        no_depth: Depth of the cells beside, metres.
 
     Returns:
-        First cell (column, row), (2,), and minimum of z and of -z in each cell from there on, (rows, columns, 2).
+        Minimum of z and of -z around each cell, metres, (rows + 2 r, columns + 2 r, 2).
     """
-    first, last = cells[0].copy(), cells[0].copy()
-    for i in range(len(cells)):
-        for k in range(2):
-            first[k], last[k] = min(first[k], cells[i, k]), max(last[k], cells[i, k])
-    minima = np.full((last[1] - first[1] + 1, last[0] - first[0] + 1, 2), no_depth, np.float32)
-    for i in range(len(cells)):
-        cell = minima[cells[i, 1] - first[1], cells[i, 0] - first[0]]
-        cell[0], cell[1] = min(cell[0], z[i]), min(cell[1], -z[i])
-    return first, minima
+    (rows, columns, _), radius = minima.shape, len(heights) - 1
+    values = minima.reshape(rows, 2 * columns)
+    around = np.full((rows + 2 * radius, 2 * (columns + 2 * radius)), no_depth, np.float32)
+    # Minimum in a column of cells, from a height above each cell to the same height below it.
+    in_column = np.full((rows + 2 * radius, 2 * columns), no_depth, np.float32)
+    for height in range(radius + 1):
+        for y in range(rows):
+            _lower(values[y], in_column[y + radius - height])
+            _lower(values[y], in_column[y + radius + height])
+        for x in range(2 * radius + 1):
+            if heights[abs(x - radius)] == height:
+                for y in range(radius - height, radius + rows + height):
+                    _lower(in_column[y], around[y, 2 * x : 2 * (x + columns)])
+    return around.reshape(rows + 2 * radius, columns + 2 * radius, 2)
 
 
 @device
@@ -74,35 +105,57 @@ def _add_missing(z: Floats32, low: Floats32, no_depth: float, inside: Bools) -> 
         inside[i] |= (z[i] <= 0) & (low[i] < no_depth)
 
 
-@kernel("(f4[:,:,::1], f4[:,::1], UniTuple(i8, 4), UniTuple(i8, 4), f4, f4, b1[:,::1])")
+@kernel("(f4[:,:,::1], UniTuple(i8, 2), f4[:,::1], UniTuple(i8, 2), f4, f4)")
 def select_pixels(
-    minima: Floats32, depth: Floats32, box: tuple[int, int, int, int], grid: tuple[int, int, int, int],
-    tolerance: float, no_depth: float, mask: Bools,
-) -> None:  # fmt: skip
-    """Select the pixels of a box whose depth lies within the range of their cell.
+    minima: Floats32, first: tuple[int, int], depth: Floats32, steps: tuple[int, int], tolerance: float, no_depth: float
+) -> Bools:
+    """Select the pixels whose depth lies within the range of their cell.
 
     Args:
         minima: Minimum of z and of -z around each cell, metres, (rows, columns, 2).
+        first: Column and row of the first cell.
         depth: Depth of every n-th pixel, metres, (h, w); 0 = no measurement.
-        box: First and last row (exclusive), first and last column (exclusive) of the box.
-        grid: Row and column of the first cell, side of the cells in pixels, stride n.
+        steps: Side of the cells in pixels, and n.
         tolerance: Tolerance of the depth, metres.
         no_depth: Pixels without depth are selected if the lower limit is below this depth, metres; 0 to select none.
-        mask: Selected pixels, (h, w); written in the box.
+
+    Returns:
+        Selected pixels, (h, w).
     """
-    begin, end, left, right = box
-    top, first, cell, stride = grid
-    low, high = np.empty(right - left, np.float32), np.empty(right - left, np.float32)
-    columns = np.arange(left, right) * stride // cell - first
-    previous = -1
-    for v in range(begin, end):
+    (left, top), (cell, stride), mask = first, steps, np.zeros(depth.shape, np.bool_)
+    begin, end = max(-(-left * cell // stride), 0), min(-(-(left + minima.shape[1]) * cell // stride), depth.shape[1])
+    columns = np.arange(begin, max(begin, end)) * stride // cell - left
+    low, high, previous = np.empty(len(columns), np.float32), np.empty(len(columns), np.float32), -1
+    for v in range(max(-(-top * cell // stride), 0), min(-(-(top + len(minima)) * cell // stride), len(depth))):
         row = v * stride // cell - top
         if row != previous:
             for i in range(len(columns)):
                 low[i] = minima[row, columns[i], 0] - tolerance
                 high[i] = tolerance - minima[row, columns[i], 1]
             previous = row
-        z, inside = depth[v, left:right], mask[v, left:right]
+        z, inside = depth[v, begin : begin + len(columns)], mask[v, begin : begin + len(columns)]
         _compare(z, low, high, inside)
         if no_depth > 0:
             _add_missing(z, low, no_depth, inside)
+    return mask
+
+
+@kernel("(i8[:,::1], f4[::1], f4[:,::1], i8, f4)")
+def count_points(cells: Ints, z: Floats32, depth: Floats32, cell: int, tolerance: float) -> tuple[int, int]:
+    """Count the points with the measured depth, and those in front of it.
+
+    Args:
+        cells: Cell (column, row) of each point, (Q, 2).
+        z: Depth of each point, metres, (Q,).
+        depth: Measured depth, metres, (H, W); 0 = no measurement. The pixel in the middle of a cell is read.
+        cell: Side of the cells, pixels.
+        tolerance: Tolerance of the depth, metres.
+    """
+    agreeing, in_front = 0, 0
+    for i in range(len(z)):
+        u = min(cell * cells[i, 0] + cell // 2, depth.shape[1] - 1)
+        v = min(cell * cells[i, 1] + cell // 2, depth.shape[0] - 1)
+        difference = depth[v, u] - z[i]
+        agreeing += abs(difference) < tolerance
+        in_front += difference > tolerance
+    return agreeing, in_front

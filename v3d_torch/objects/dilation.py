@@ -31,7 +31,7 @@ def _dilate_compiled(mask: Tensor, pixels: int) -> Tensor:
     crop = crop_around(source, pixels)
     dilated = np.zeros_like(source)
     if crop is not None:
-        dilated[crop] = kernels.dilate(np.ascontiguousarray(source[crop]), _heights(pixels))
+        dilated[crop] = kernels.dilate(np.ascontiguousarray(source[crop]), ellipse_heights(pixels))
     return torch.from_numpy(dilated).view(torch.bool)
 
 
@@ -55,6 +55,6 @@ def dilate(mask: Tensor, pixels: int) -> Tensor:
 
 
 @cache
-def _heights(radius: int) -> NDArray[np.uint8]:
-    """Height of the ellipse above its centre, in each column from the centre to the right, pixels."""
+def ellipse_heights(radius: int) -> NDArray[np.uint8]:
+    """Height of `ellipse` above its centre, in each column from the centre to the right, pixels."""
     return (ellipse(radius)[:, radius:].sum(axis=0) // 2).astype(np.uint8)

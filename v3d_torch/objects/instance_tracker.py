@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -21,7 +21,6 @@ from v3d_torch.objects.track_matching import (
     DetectedInstances,
     PredictedTracks,
     compare_tracks,
-    compare_without_masks,
     predict_tracks,
     to_detections,
 )
@@ -152,8 +151,9 @@ class InstanceTracker(torch.nn.Module):
 
         # Update matched tracks, and start a track for each instance without a match, unless it shows a matched object
         # or is tiny, such as the rest of a person who goes behind another.
-        updated: list[Track] = []
+        updated: dict[int, Track] = {}
         is_tiny = (count_pixels(detected.coarse_masks) < _MIN_COARSE_PIXELS).tolist()
+        labels, scores = instances.labels.tolist(), instances.scores.tolist()
         for i, detection in enumerate(detected.detections):
             track = matches.get(i)
             if track is None and (is_tiny[i] or self._is_duplicate(i, matches, detected)):
@@ -162,13 +162,13 @@ class InstanceTracker(torch.nn.Module):
             track = matches[i] = track or self._start_track(stamp, masks)
             track.add_detection(detection)
             track.set_masks(*masks, missed=False, is_shown=True)
-            track.update_label(int(instances.labels[i]), float(instances.scores[i]))
+            track.update_label(labels[i], scores[i])
             if detected.appearance is not None:
                 track.update_appearance(detected.appearance[i])
-            updated.append(track)
+            updated[i] = track
 
-        missed = self._predict_missed_tracks(stamp, depth, predicted, updated)
-        self.tracks = sorted([*updated, *missed], key=lambda track: track.id)
+        missed = self._predict_missed_tracks(stamp, depth, predicted, detected, updated)
+        self.tracks = sorted([*updated.values(), *missed], key=lambda track: track.id)
         self.last_stamp = stamp
         return list(self.tracks)
 
@@ -235,12 +235,7 @@ class InstanceTracker(torch.nn.Module):
         labels = set(detected.labels.tolist())  # an instance continues a track without a mask only if it has its class
         without_masks = [track for track in (*self.resting, *self.lost) if track.label in labels]
         tracks = [*predicted.tracks, *without_masks]
-        log_ratio = torch.cat(
-            [
-                compare_tracks(predicted, detected, self._config),
-                compare_without_masks(without_masks, detected, self._config),
-            ]
-        )
+        log_ratio = compare_tracks(predicted, without_masks, detected, self._config)
         instance_has_class = detected.labels != UNLABELLED
         track_has_class = torch.tensor([track.label != UNLABELLED for track in tracks], dtype=torch.bool)
         first_choice = torch.tensor([track.is_confirmed or track in self.resting for track in tracks], dtype=torch.bool)
@@ -289,14 +284,19 @@ class InstanceTracker(torch.nn.Module):
         return track
 
     def _predict_missed_tracks(
-        self, stamp: float, depth: Tensor, predicted: PredictedTracks, updated: Sequence[Track]
+        self,
+        stamp: float,
+        depth: Tensor,
+        predicted: PredictedTracks,
+        detected: DetectedInstances,
+        updated: Mapping[int, Track],
     ) -> list[Track]:
         """Predict the masks of the missed tracks that may move and are not lost; return these."""
         missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
-        unmatched = {i: track for i, track in enumerate(predicted.tracks) if track not in updated}
+        unmatched = {i: track for i, track in enumerate(predicted.tracks) if track not in updated.values()}
         coarse_masks = predicted.coarse_masks[list(unmatched)] & pack_masks(has_depth, self._stride)
-        covered = self._covered(list(unmatched.values()), coarse_masks, updated)
+        covered = self._covered(list(unmatched.values()), coarse_masks, detected, updated)
         for (i, track), is_covered in zip(unmatched.items(), covered, strict=True):
             if not track.may_move:
                 track.drop_masks()
@@ -328,7 +328,9 @@ class InstanceTracker(torch.nn.Module):
         candidates = [*self.lost, *(track for track in lost if track.is_confirmed)]
         self.lost = [track for track in candidates if stamp - track.newest.stamp <= max_age]
 
-    def _covered(self, tracks: Sequence[Track], coarse_masks: Tensor, updated: Sequence[Track]) -> list[bool]:
+    def _covered(
+        self, tracks: Sequence[Track], coarse_masks: Tensor, detected: DetectedInstances, updated: Mapping[int, Track]
+    ) -> list[bool]:
         """Check for each track whether its predicted mask shows the surface of a detected track of the same class.
 
         The surface of the other track is given by its cloud, which is that of one person; a network sometimes draws one
@@ -337,16 +339,18 @@ class InstanceTracker(torch.nn.Module):
         Args:
             tracks: T tracks.
             coarse_masks: Their predicted coarse masks where there is depth, packed, shape (T, B).
-            updated: Tracks that were detected.
+            detected: Instances of the frame.
+            updated: Tracks that were detected, by the index of the instance.
         """
-        with_centroid = [track for track in updated if track.newest.has_centroid]
+        with_centroid = [i for i, track in updated.items() if track.newest.has_centroid]
         if not with_centroid or not tracks:
             return [False] * len(tracks)
-        surfaces = torch.stack([pack_masks(other.cloud_pixels, self._stride) for other in with_centroid])
-        common = count_common_pixels(coarse_masks, surfaces)
+        common = count_common_pixels(coarse_masks, detected.coarse_surfaces[with_centroid])
         is_over = common > _MIN_COVERED_FRACTION * count_pixels(coarse_masks)[:, None]
-        same_class = torch.tensor([[track.label == other.label for other in with_centroid] for track in tracks])
-        covered: list[bool] = (is_over & same_class).any(dim=1).tolist()
+        of_track, of_other = (
+            torch.tensor([each.label for each in some]) for some in (tracks, [updated[i] for i in with_centroid])
+        )
+        covered: list[bool] = (is_over & (of_track[:, None] == of_other)).any(dim=1).tolist()
         return covered
 
 

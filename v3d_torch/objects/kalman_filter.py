@@ -33,9 +33,6 @@ seconds. And weight of its initial value 1, in measurements; it decays like the 
 _MIN_FACTOR, _MAX_FACTOR = 0.05, 4.0
 """Range of the variance factor: someone who walks evenly can still turn, and a jump of the mask is no motion."""
 
-_MIN_SPEED = 1e-9
-"""Lower bound of the speed as a divisor, m/s."""
-
 
 class ConstantVelocityKalmanFilter:
     """Constant-velocity Kalman filter of one object, of which a changing part is visible.
@@ -78,7 +75,7 @@ class ConstantVelocityKalmanFilter:
             position: Measured position, world frame, metres, float64, shape :math:`(3,)`. NaN is ignored.
             sigma: Standard deviation of each coordinate of the offset of the visible part, metres.
         """
-        if not bool(torch.isfinite(position).all()):
+        if not all(map(math.isfinite, position.tolist())):
             return
         if self.state.is_known:
             self._predict(stamp, sigma)
@@ -110,9 +107,9 @@ class ConstantVelocityKalmanFilter:
     def _start(self, stamp: float, measured: Tensor, sigma: float) -> None:
         """Start with a measured position and without velocity."""
         variance, speed_variance = _CENTROID_SIGMA**2, _INITIAL_SPEED_SIGMA**2
-        known = replace(self.state, stamp=stamp, position=measured, velocity=torch.zeros_like(measured))
-        self.state = replace(known, variances=(sigma**2 + variance, 0.0, speed_variance))
-        self.visible_state = replace(known, variances=(variance, 0.0, speed_variance))
+        at_rest, noise = torch.zeros_like(measured), self.state.acceleration_noise
+        self.state = ObjectState(stamp, measured, at_rest, (sigma**2 + variance, 0.0, speed_variance), noise)
+        self.visible_state = ObjectState(stamp, measured, at_rest, (variance, 0.0, speed_variance), noise)
         slow = _SLOW_FRACTION * sigma**2
         self._offset_covariances, self._offset_sigma = (-slow, 0.0, slow), sigma
 
@@ -141,20 +138,18 @@ class ConstantVelocityKalmanFilter:
         self._squared_innovations += float(innovation @ weighted) / len(innovation)  # 1 is expected
         self._measurements += 1
         factor = min(max(self._squared_innovations / self._measurements, _MIN_FACTOR), _MAX_FACTOR)
-        velocity = self.state.velocity + v * weighted
-        self.state = replace(
-            self.state,
-            position=self.state.position + p * weighted,
-            velocity=velocity * min(1.0, self._max_speed / max(float(velocity.norm()), _MIN_SPEED)),
-            variances=(pp - p * p / variance, pv - p * v / variance, vv - v * v / variance),
-        )
+        position, velocity = self.state.position + p * weighted, self.state.velocity + v * weighted
+        speed = math.hypot(*velocity.tolist())
+        if speed > self._max_speed:
+            velocity = velocity * (self._max_speed / speed)
+        variances = pp - p * p / variance, pv - p * v / variance, vv - v * v / variance
+        stamp, noise = self.state.stamp, self.state.acceleration_noise
+        self.state = ObjectState(stamp, position, velocity, variances, noise)
+        # The visible part is where it was measured, but for the noise of the measurement.
         noise_fraction = _CENTROID_SIGMA**2 / variance
         position_variance, covariance = _CENTROID_SIGMA**2 * (1 - noise_fraction), v * noise_fraction
-        self.visible_state = replace(
-            self.state,
-            position=measured - noise_fraction * innovation,
-            variances=(position_variance, math.sqrt(factor) * covariance, factor * self.state.variances[2]),
-            acceleration_noise=math.sqrt(factor) * self.state.acceleration_noise,
-        )
+        variances = position_variance, math.sqrt(factor) * covariance, factor * variances[2]
+        position = measured - noise_fraction * innovation
+        self.visible_state = ObjectState(stamp, position, velocity, variances, math.sqrt(factor) * noise)
         self._offset = self._offset + o * weighted
         self._offset_covariances = po - p * o / variance, vo - v * o / variance, oo - o * o / variance

@@ -37,7 +37,7 @@ class ObjectState:
     @cached_property
     def is_known(self) -> bool:
         """True once a centroid has been measured."""
-        return bool(torch.isfinite(self.position).all())
+        return all(map(math.isfinite, self.position.tolist()))
 
     @property
     def sigmas(self) -> tuple[float, float]:
@@ -63,13 +63,16 @@ class ObjectState:
         Args:
             stamp: Timestamp, not earlier than that of the state, seconds.
         """
-        if stamp == self.stamp or not self.is_known:
+        if stamp == self.stamp:
+            return self
+        if not self.is_known:
             return replace(self, stamp=stamp)
         dt, noise = stamp - self.stamp, self.acceleration_noise**2
         pp, pv, vv = self.variances
         pp += 2 * dt * pv + dt**2 * vv + noise * dt**3 / 3
         variances = pp, pv + dt * vv + noise * dt**2 / 2, vv + noise * dt
-        return replace(self, stamp=stamp, position=self.position + self.velocity * dt, variances=variances)
+        position = self.position + self.velocity * dt
+        return ObjectState(stamp, position, self.velocity, variances, self.acceleration_noise)
 
     def motion_variance(self, seconds: float) -> float:
         """Return the variance of each coordinate of the motion in a time, relative to the prediction, square metres."""
@@ -97,7 +100,7 @@ class ObjectState:
             decay**2 * vv + noise * time_constant * (1 - decay**2) / 2,
         )
         position, velocity = self.position + self.velocity * reach, self.velocity * decay
-        return replace(self, stamp=stamp, position=position, velocity=velocity, variances=variances)
+        return ObjectState(stamp, position, velocity, variances, self.acceleration_noise)
 
     def predict_at_rest(self, stamp: float) -> ObjectState:
         """Predict the state of an object that does not move: it is where it was, as accurately as it was known.
@@ -105,7 +108,8 @@ class ObjectState:
         Args:
             stamp: Timestamp, seconds.
         """
-        return replace(self, stamp=stamp, velocity=self.velocity * 0, variances=(self.variances[0], 0.0, 0.0))
+        variances = self.variances[0], 0.0, 0.0
+        return ObjectState(stamp, self.position, torch.zeros_like(self.velocity), variances, self.acceleration_noise)
 
     def transform(self, T_new_old: Tensor) -> ObjectState:
         """Transform the state into another world frame; the covariance is the same in all of them.

@@ -7,7 +7,7 @@ the wall. The outlier-free cloud of an object gives the range of depths that bel
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import silhouette as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
-from v3d_torch.objects.dilation import ellipse
+from v3d_torch.objects.dilation import ellipse, ellipse_heights
 
 CELL_SIZE = 4
 """Side of the cells that collect the depths of a cloud, pixels: smaller than a cell of the network's masks, 6 pixels
@@ -33,15 +33,30 @@ _NO_DEPTH = 1e6
 _MIN_DEPTH = 0.1
 """Minimum depth of projected points, metres."""
 
-ProjectedCells = tuple[NDArray[np.int64], NDArray[np.float32]]
-"""Cell (column, row), shape (P, 2), and depth, metres, shape (P,), of the points of a cloud that are in the image."""
-
 Minima = NDArray[np.float32]
 """Minimum of z and of -z in or around each cell, metres, shape (rows, columns, 2)."""
 
 
+class ProjectedCloud(NamedTuple):
+    """Points of a cloud that are in the image.
+
+    Attributes:
+        cells: Cell (column, row) of each point, int64, shape :math:`(P, 2)`.
+        z: Depth of each point, metres, float32, shape :math:`(P,)`.
+        minima: Minimum of z and of -z in each cell from the first one on, metres, shape :math:`(h, w, 2)`.
+        first: First cell (column, row).
+        median_depth: Median of the depths, metres; 0 without points.
+    """
+
+    cells: NDArray[np.int64]
+    z: NDArray[np.float32]
+    minima: Minima
+    first: tuple[int, int]
+    median_depth: float
+
+
 def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float) -> list[Silhouette]:
-    """Project several clouds into an image at once.
+    """Project several clouds into an image.
 
     Args:
         clouds: Point clouds, camera frame, metres, each of shape :math:`(P, 3)`.
@@ -51,70 +66,61 @@ def silhouettes(clouds: Sequence[Tensor], camera: PinholeCamera, spacing: float)
     Returns:
         Silhouette of each cloud.
     """
-    return [Silhouette(cells, z, camera, spacing) for cells, z in _project_to_cells(clouds, camera)]
+    return [Silhouette(_project(cloud, camera), camera, spacing) for cloud in clouds]
 
 
-def _project_to_cells_compiled(clouds: Sequence[Tensor], camera: PinholeCamera) -> list[ProjectedCells]:
-    if any(cloud.requires_grad for cloud in clouds):
-        return NotImplemented
-    points = [cloud.to(torch.float64).numpy() for cloud in clouds]
-    return [kernels.project_to_cells(each, _MIN_DEPTH, CELL_SIZE, camera.intrinsics, camera.bounds) for each in points]
+def _project_compiled(cloud: Tensor, camera: PinholeCamera) -> ProjectedCloud:
+    points = cloud.to(torch.float64).numpy()
+    return ProjectedCloud(
+        *kernels.project_to_cells(points, _MIN_DEPTH, CELL_SIZE, _NO_DEPTH, camera.intrinsics, camera.bounds)
+    )
 
 
-@compiled_by(_project_to_cells_compiled)
-def _project_to_cells(clouds: Sequence[Tensor], camera: PinholeCamera) -> list[ProjectedCells]:
-    """Project several clouds (P, 3) into an image at once."""
-    if not clouds:
-        return []
-    # One contiguous row per coordinate is faster to project.
-    points = torch.cat([cloud.T for cloud in clouds], dim=1).to(torch.float64).T
+@compiled_by(_project_compiled)
+def _project(cloud: Tensor, camera: PinholeCamera) -> ProjectedCloud:
+    """Project a cloud (P, 3) into an image."""
+    points = cloud.detach().to(torch.float64)
     pixels, inside = camera.project_to_image(points, _MIN_DEPTH)
-    projected = inside.numpy()
     # Pixel centres lie at integers, so a cell begins half a pixel before its first pixel centre.
-    cells = np.floor((pixels.numpy()[projected] + 0.5) / CELL_SIZE).astype(np.int64)
-    z = points[:, 2].numpy()[projected].astype(np.float32)
-    ends = np.concatenate([[0], projected.cumsum()])[np.cumsum([0, *map(len, clouds)])]
-    return [(cells[begin:end], z[begin:end]) for begin, end in pairwise(ends.tolist())]
-
-
-def _bin_depths_compiled(cells: NDArray[np.int64], z: NDArray[np.float32]) -> tuple[NDArray[np.int64], Minima]:
-    return kernels.bin_depths(cells, z, _NO_DEPTH)
-
-
-@compiled_by(_bin_depths_compiled)
-def _bin_depths(cells: NDArray[np.int64], z: NDArray[np.float32]) -> tuple[NDArray[np.int64], Minima]:
-    """Return the first cell (column, row), and the minima of z and of -z in each cell from there on."""
+    cells = np.floor((pixels[inside].numpy() + 0.5) / CELL_SIZE).astype(np.int64)
+    z = points[inside, 2].numpy().astype(np.float32)
+    if len(z) == 0:
+        return ProjectedCloud(cells, z, np.zeros((0, 0, 2), np.float32), (0, 0), 0.0)
     first = cells.min(axis=0)
     columns, rows = (cells.max(axis=0) - first + 1).tolist()
     column, row = (cells - first).T
-    minima = np.full(2 * rows * columns, _NO_DEPTH, np.float32)
-    index = 2 * (row * columns + column)
-    np.minimum.at(minima, index, z)
-    np.minimum.at(minima, index + 1, -z)
-    return first, minima.reshape(rows, columns, 2)
+    minima = np.full((rows, columns, 2), _NO_DEPTH, np.float32)
+    np.minimum.at(minima, (row, column, 0), z)
+    np.minimum.at(minima, (row, column, 1), -z)
+    middle = len(z) // 2
+    return ProjectedCloud(cells, z, minima, (int(first[0]), int(first[1])), float(np.partition(z, middle)[middle]))
+
+
+def _minima_around_compiled(minima: Minima, radius: int) -> Minima:
+    return kernels.minima_around(minima, ellipse_heights(radius), _NO_DEPTH)
+
+
+@compiled_by(_minima_around_compiled)
+def _minima_around(minima: Minima, radius: int) -> Minima:
+    """Return the minima in a circle around each cell, also around the empty cells within the radius of the others."""
+    border = (radius, radius, radius, radius)
+    padded = cv2.copyMakeBorder(minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
+    return np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
 
 
 def _select_pixels_compiled(
-    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, stride: int, include_missing: bool
+    minima: Minima, first: tuple[int, int], depth: Tensor, tolerance: float, stride: int, include_missing: bool
 ) -> Tensor:
     if depth.dtype != torch.float32:
         return NotImplemented
-    _, height, width = depth.shape
-    left, top = first.tolist()
-    rows, columns = (
-        _pixels_of_cells(top, len(minima), stride, height),
-        _pixels_of_cells(left, minima.shape[1], stride, width),
-    )
-    mask = np.zeros((height, width), np.bool_)
-    box, grid = (rows.start, rows.stop, columns.start, columns.stop), (top, left, CELL_SIZE, stride)
     no_depth = _NO_DEPTH / 2 if include_missing else 0.0
-    kernels.select_pixels(minima, to_array(depth[0]), box, grid, tolerance, no_depth, mask)
+    mask = kernels.select_pixels(minima, first, to_array(depth[0]), (CELL_SIZE, stride), tolerance, no_depth)
     return torch.from_numpy(mask)
 
 
 @compiled_by(_select_pixels_compiled)
 def _select_pixels(
-    minima: Minima, first: NDArray[np.int64], depth: Tensor, tolerance: float, stride: int, include_missing: bool
+    minima: Minima, first: tuple[int, int], depth: Tensor, tolerance: float, stride: int, include_missing: bool
 ) -> Tensor:
     """Select the pixels whose depth lies within the range of their cell.
 
@@ -130,7 +136,7 @@ def _select_pixels(
         Mask, bool, shape (h, w).
     """
     mask = np.zeros(depth.shape[1:], np.bool_)
-    left, top = first.tolist()
+    left, top = first
     v, u = (
         _pixels_of_cells(top, len(minima), stride, depth.shape[1]),
         _pixels_of_cells(left, minima.shape[1], stride, depth.shape[2]),
@@ -150,26 +156,44 @@ def _select_pixels(
     return torch.from_numpy(mask)
 
 
+def _count_points_compiled(
+    cells: NDArray[np.int64], z: NDArray[np.float32], depth: Tensor, tolerance: float
+) -> tuple[int, int]:
+    if depth.dtype != torch.float32:
+        return NotImplemented
+    return kernels.count_points(cells, z, to_array(depth[0]), CELL_SIZE, tolerance)
+
+
+@compiled_by(_count_points_compiled)
+def _count_points(cells: NDArray[np.int64], z: NDArray[np.float32], depth: Tensor, tolerance: float) -> tuple[int, int]:
+    """Count the points with the measured depth, and those in front of it, at the centre of the cell of each point.
+
+    Args:
+        cells: Cell (column, row) of each point, shape (P, 2).
+        z: Depth of each point, metres, shape (P,).
+        depth: Measured depth, metres, shape (1, H, W); 0 = no measurement.
+        tolerance: Tolerance of the depth, metres.
+    """
+    _, height, width = depth.shape
+    u, v = np.minimum(CELL_SIZE * cells + CELL_SIZE // 2, (width - 1, height - 1)).T
+    difference = depth[0].numpy()[v, u] - z
+    return int((np.abs(difference) < tolerance).sum()), int((difference > tolerance).sum())
+
+
 class Silhouette:
     """Projection of a cloud into an image.
 
     Args:
-        cells: Cell (column, row) of each projected point, int64, shape :math:`(P, 2)`.
-        z: Depth of each projected point, metres, float32, shape :math:`(P,)`.
+        projected: Points of the cloud that are in the image.
         camera: Camera of the image.
         spacing: Spacing of the points, metres.
     """
 
-    def __init__(self, cells: NDArray[np.int64], z: NDArray[np.float32], camera: PinholeCamera, spacing: float) -> None:
-        self._cells, self._z = cells, z
-        if len(z) == 0:
-            return
-        middle = len(z) // 2
-        median_depth = float(np.partition(z, middle)[middle])
-        self._gap = spacing * camera.fx / median_depth
-        # Minimum of z and of -z in each cell: one erosion then finds the nearest and the farthest depth around a cell.
-        self._first_cell, self._minima = _bin_depths(cells, z)
-        self._eroded: dict[int, Minima] = {}  # by radius
+    def __init__(self, projected: ProjectedCloud, camera: PinholeCamera, spacing: float) -> None:
+        self._projected = projected
+        self._gap = spacing * camera.fx / projected.median_depth if len(projected.z) else 0.0
+        # Minima of z and of -z give the nearest and the farthest depth around a cell.
+        self._around: dict[int, Minima] = {}  # by radius
 
     def mask(
         self,
@@ -195,20 +219,14 @@ class Silhouette:
         Returns:
             Mask of the pixels of ``depth``, bool, shape :math:`(h, w)`; empty if no point is in the image.
         """
-        if len(self._z) == 0:
+        if len(self._projected.z) == 0:
             return torch.zeros(depth.shape[1:], dtype=torch.bool)
         radius = max(round((margin + self._gap) / CELL_SIZE), 1)
-        if radius not in self._eroded:
-            self._eroded[radius] = self._erode(radius)
-        top, left = origin
-        first = self._first_cell - radius - (left // CELL_SIZE, top // CELL_SIZE)
-        return _select_pixels(self._eroded[radius], first, depth, tolerance, stride, include_missing)
-
-    def _erode(self, radius: int) -> Minima:
-        """Return the minima around each cell, also around the empty cells within the radius of the others."""
-        border = (radius, radius, radius, radius)
-        padded = cv2.copyMakeBorder(self._minima, *border, cv2.BORDER_CONSTANT, value=(_NO_DEPTH, _NO_DEPTH))
-        return np.asarray(cv2.erode(padded, ellipse(radius)), np.float32)
+        if radius not in self._around:
+            self._around[radius] = _minima_around(self._projected.minima, radius)
+        (left, top), (first_row, first_column) = self._projected.first, origin
+        first = left - radius - first_column // CELL_SIZE, top - radius - first_row // CELL_SIZE
+        return _select_pixels(self._around[radius], first, depth, tolerance, stride, include_missing)
 
     def visible_fraction(self, depth: Tensor) -> float:
         """Return the fraction of projected points whose depth is the measured depth.
@@ -219,9 +237,8 @@ class Silhouette:
         Returns:
             Fraction of the points, from 0 to 1; 0 if no point is in the image.
         """
-        if len(self._z) == 0:
-            return 0.0
-        return float((np.abs(self._measured_depth(depth) - self._z) < DEPTH_TOLERANCE).mean())
+        cells, z = self._projected.cells, self._projected.z
+        return _count_points(cells, z, depth, DEPTH_TOLERANCE)[0] / max(len(z), 1)
 
     def count_vacated(self, depth: Tensor) -> int:
         """Count the projected points behind which a surface is measured, so that their place is empty.
@@ -229,13 +246,7 @@ class Silhouette:
         Args:
             depth: Measured depth, metres, shape :math:`(1, H, W)`; 0 = no measurement.
         """
-        return 0 if len(self._z) == 0 else int((self._measured_depth(depth) - self._z > DEPTH_TOLERANCE).sum())
-
-    def _measured_depth(self, depth: Tensor) -> NDArray[np.float32]:
-        """Return the measured depth at the centre of the cell of each projected point, metres, shape (P,)."""
-        _, height, width = depth.shape
-        u, v = np.minimum(CELL_SIZE * self._cells + CELL_SIZE // 2, (width - 1, height - 1)).T
-        return depth[0].numpy()[v, u]
+        return _count_points(self._projected.cells, self._projected.z, depth, DEPTH_TOLERANCE)[1]
 
 
 def _pixels_of_cells(first: int, count: int, stride: int, size: int) -> slice:

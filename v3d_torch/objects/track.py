@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
@@ -68,7 +69,7 @@ class Detection3D:
     @cached_property
     def has_centroid(self) -> bool:
         """True if the centroid is known."""
-        return bool(torch.isfinite(self.centroid).all())
+        return all(map(math.isfinite, self.centroid.tolist()))
 
     def transform(self, T_new_old: Tensor) -> Detection3D:
         """Return the detection in another world frame; ``T_new_old`` is float64, shape :math:`(4, 4)`."""

@@ -11,6 +11,7 @@ from torch import Tensor
 from v3d_torch.config import CloudConfig, TrackerConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
+from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.objects.appearance import histogram_similarity
 from v3d_torch.objects.instance_clouds import InstanceClouds
 from v3d_torch.objects.log_ratios import (
@@ -46,6 +47,8 @@ class DetectedInstances:
         labels: Class of each of N instances, int64, shape :math:`(N,)`.
         detections: Detections of the instances.
         coarse_masks: Every n-th pixel of the masks, packed, uint8, shape :math:`(N, B)`.
+        coarse_surfaces: Every n-th pixel of the masks whose depth belongs to the object, packed, uint8, shape
+            :math:`(N, B)`.
         appearance: Colour histograms, float32, shape :math:`(N, D)`, NaN if unknown; None if they are not compared.
     """
 
@@ -53,6 +56,7 @@ class DetectedInstances:
     labels: Tensor
     detections: Sequence[Detection3D]
     coarse_masks: Tensor
+    coarse_surfaces: Tensor
     appearance: Tensor | None
 
     def __len__(self) -> int:
@@ -100,17 +104,11 @@ def to_detections(
         T_wc: Camera-to-world pose, float64, shape :math:`(4, 4)`.
         stride: Step between the coarse pixels, pixels.
     """
-    detections = [
-        Detection3D(stamp, centroid.to(torch.float64), points[valid]).transform(T_wc)
-        for points, valid, centroid in zip(clouds.points, clouds.valid, clouds.centroid, strict=True)
-    ]
-    return DetectedInstances(
-        stamp,
-        instances.labels,
-        detections,
-        pack_masks(instances.masks, stride),
-        appearance,
-    )
+    centroids = transform_points(T_wc, clouds.centroid.to(torch.float64))
+    points = transform_points(T_wc, clouds.points[clouds.valid]).split(clouds.valid.sum(dim=1).tolist())
+    detections = [Detection3D(stamp, *each) for each in zip(centroids, points, strict=True)]
+    coarse_masks, coarse_surfaces = (pack_masks(each, stride) for each in (instances.masks, clouds.cloud_pixels))
+    return DetectedInstances(stamp, instances.labels, detections, coarse_masks, coarse_surfaces, appearance)
 
 
 def predict_tracks(
@@ -147,8 +145,54 @@ def predict_tracks(
     )
 
 
-def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, config: TrackerConfig) -> Tensor:
+def compare_tracks(
+    predicted: PredictedTracks, without_masks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig
+) -> Tensor:
     """Add up the log-likelihood ratios of each pair of a track and an instance.
+
+    An instance can continue a track of its class if it lies within the gate; if the mask of the track is predicted, see
+    `_compare_masks` for more. The size of the visible part of a track without a predicted mask, for the log ratio of
+    appearances, is the mean over its detections: the last visible part of an object that left the image is small.
+
+    Args:
+        predicted: T tracks whose masks are predicted.
+        without_masks: U other tracks.
+        detected: N instances.
+        config: Gates.
+
+    Returns:
+        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T + U, N)`.
+    """
+    tracks, stamp, count = [*predicted.tracks, *without_masks], detected.stamp, len(predicted.tracks)
+    if not tracks:
+        return torch.zeros(0, len(detected), dtype=torch.float64)
+    states = [track.predict_state(stamp) for track in predicted.tracks]
+    states += [track.predict_unobserved_state(stamp) for track in without_masks]
+    points: list[float] = [len(track.newest.cloud) for track in predicted.tracks]
+    points += [track.appearance_points for track in without_masks]
+    elapsed = torch.tensor([[stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
+    same_class = torch.tensor([track.label for track in tracks])[:, None] == detected.labels
+    squared_distance = _squared_distances(states, detected)
+    near = squared_distance.sqrt() <= config.max_jump + config.max_speed * elapsed  # the maximum motion of the track
+    possible = same_class & near
+    of_masks = torch.zeros_like(squared_distance)
+    if count:
+        of_masks[:count], possible[:count] = _compare_masks(
+            predicted, detected, same_class[:count], near[:count], config.min_overlap
+        )
+    log_ratio = (
+        _position_log_ratio(squared_distance, tracks, states, detected, possible)
+        + of_masks
+        + _appearance_log_ratio(tracks, detected, elapsed, points)
+        + class_log_ratio(same_class)
+    )
+    return log_ratio.masked_fill(~possible, -torch.inf)
+
+
+def _compare_masks(
+    predicted: PredictedTracks, detected: DetectedInstances, same_class: Tensor, near: Tensor, min_overlap: float
+) -> tuple[Tensor, Tensor]:
+    """Add up the log-likelihood ratios of masks and of vacated places.
 
     An instance can continue a track of its class if it lies within the gate or covers the predicted mask. It can
     continue a track of any class if it overlaps the last or the predicted mask, because the position jumps when an
@@ -158,13 +202,13 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
     Args:
         predicted: T tracks.
         detected: N instances.
-        config: Gates.
+        same_class: Pairs of the same class, bool, shape (T, N).
+        near: Pairs within the gate, bool, shape (T, N).
+        min_overlap: Minimum intersection over union of a pair of different classes.
 
     Returns:
-        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
+        Log-likelihood ratio, float64, and whether the pair is possible, bool, shape (T, N).
     """
-    if not predicted.tracks:
-        return torch.zeros(0, len(detected), dtype=torch.float64)
     # The last mask is accurate if little moves; the predicted mask follows fast walkers and a turning camera.
     last_masks = torch.stack([track.coarse_mask for track in predicted.tracks])
     intersection = count_common_pixels(predicted.coarse_masks, detected.coarse_masks)
@@ -176,49 +220,11 @@ def compare_tracks(predicted: PredictedTracks, detected: DetectedInstances, conf
         ),
         _intersection_over_union(intersection, predicted_areas, areas),
     )
-    same_class = _same_class(predicted.tracks, detected)
     beside = predicted.visible[:, None] & (coverage < _MAX_BESIDE_COVERAGE)
-    states = [track.predict_state(detected.stamp) for track in predicted.tracks]
-    squared_distance = _squared_distances(states, detected)
-    near = _within_gate(squared_distance, predicted.tracks, detected, config) & ~beside
-    possible = (same_class & (near | (coverage >= _MIN_COVERAGE))) | (overlap >= config.min_overlap)
+    possible = (same_class & ((near & ~beside) | (coverage >= _MIN_COVERAGE))) | (overlap >= min_overlap)
     visible = predicted.visible_fractions * (predicted_areas[:, 0] > 0)
-    log_ratio = (
-        _position_log_ratio(squared_distance, predicted.tracks, states, detected, possible)
-        + overlap_log_ratio(coverage, overlap, visible)
-        + _appearance_log_ratio(predicted.tracks, detected, [len(track.newest.cloud) for track in predicted.tracks])
-        + class_log_ratio(same_class)
-        + torch.tensor([[track.vacated_log_ratio] for track in predicted.tracks], dtype=torch.float64)
-    )
-    return log_ratio.masked_fill(~possible, -torch.inf)
-
-
-def compare_without_masks(tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig) -> Tensor:
-    """Add up the log-likelihood ratios of each pair of a track without a predicted mask and an instance.
-
-    The size of the visible part of a track, for the log ratio of appearances, is the mean over its detections: the last
-    visible part of an object that left the image is small.
-
-    Args:
-        tracks: T tracks.
-        detected: N instances.
-        config: Gates.
-
-    Returns:
-        Log-likelihood ratio of each pair, -inf if it is impossible, float64, shape :math:`(T, N)`.
-    """
-    if not tracks:
-        return torch.zeros(0, len(detected), dtype=torch.float64)
-    same_class = _same_class(tracks, detected)
-    states = [track.predict_unobserved_state(detected.stamp) for track in tracks]
-    squared_distance = _squared_distances(states, detected)
-    possible = same_class & _within_gate(squared_distance, tracks, detected, config)
-    log_ratio = (
-        _position_log_ratio(squared_distance, tracks, states, detected, possible)
-        + _appearance_log_ratio(tracks, detected, [track.appearance_points for track in tracks])
-        + class_log_ratio(same_class)
-    )
-    return log_ratio.masked_fill(~possible, -torch.inf)
+    vacated = torch.tensor([[track.vacated_log_ratio] for track in predicted.tracks], dtype=torch.float64)
+    return overlap_log_ratio(coverage, overlap, visible) + vacated, possible
 
 
 def _squared_distances(states: Sequence[ObjectState], detected: DetectedInstances) -> Tensor:
@@ -244,7 +250,7 @@ def _position_log_ratio(
 
 
 def _appearance_log_ratio(
-    tracks: Sequence[Track], detected: DetectedInstances, tracked_points: Sequence[float]
+    tracks: Sequence[Track], detected: DetectedInstances, elapsed: Tensor, tracked_points: Sequence[float]
 ) -> Tensor:
     """Log ratio of appearances, shape (T, N), with the points of the tracks' views; 0 if they are not compared."""
     if detected.appearance is None:
@@ -253,26 +259,9 @@ def _appearance_log_ratio(
     known = [track.appearance for track in tracks]
     appearance = torch.stack([unknown if each is None or each.shape != unknown.shape else each for each in known])
     similarity = histogram_similarity(appearance, detected.appearance).to(torch.float64)
-    elapsed = _elapsed(tracks, detected)
     tracked = torch.tensor(tracked_points, dtype=torch.float64)[:, None]
     points = torch.tensor([len(detection.cloud) for detection in detected.detections], dtype=torch.float64)
     return appearance_log_ratio(similarity, elapsed, torch.minimum(tracked, points), torch.maximum(tracked, points))
-
-
-def _same_class(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
-    return torch.tensor([track.label for track in tracks])[:, None] == detected.labels
-
-
-def _within_gate(
-    squared_distance: Tensor, tracks: Sequence[Track], detected: DetectedInstances, config: TrackerConfig
-) -> Tensor:
-    """Mask of the pairs whose distance is within the maximum motion of the track, bool, shape (T, N)."""
-    return squared_distance.sqrt() <= config.max_jump + config.max_speed * _elapsed(tracks, detected)
-
-
-def _elapsed(tracks: Sequence[Track], detected: DetectedInstances) -> Tensor:
-    """Time since the last detection of each track, seconds, float64, shape (T, 1)."""
-    return torch.tensor([[detected.stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
 
 
 def _intersection_over_union(intersection: Tensor, a: Tensor, b: Tensor) -> Tensor:
