@@ -3,6 +3,8 @@
 The points are grouped by cells of a grid whose diagonal is the radius (Gunawan, Eindhoven University of Technology
 2013): all points of a cell are neighbours, so that its core points belong to one cluster. Most distances are not
 computed: a cell with enough points has only core points, and two cells are compared until one pair connects them.
+Cells are numbered along y, then x, then z: what a camera sees is extended along y and thin along z, so that the cells
+near a cell lie in a few long runs.
 """
 
 from __future__ import annotations
@@ -21,10 +23,13 @@ MAX_CELLS = 2.0**20
 _MARGIN = 1e-9
 """Relative difference between the diagonal of a cell and the radius, more than the rounding errors of cell indices."""
 
+_STEPS = ((0, 0), (0, 1), (1, 0), (1, -1), (1, 1), (0, 2), (2, 0), (1, -2), (1, 2), (2, -1), (2, 1), (2, -2), (2, 2))
+"""Steps along z and x to the cells with which a cell is compared, nearest first: the nearest decide most cases."""
+
 
 @device
 def _is_near(points: Floats, i: int, j: int, squared_radius: float) -> bool:
-    x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+    x, y, z = points[0, i] - points[0, j], points[1, i] - points[1, j], points[2, i] - points[2, j]
     return x * x + y * y + z * z <= squared_radius
 
 
@@ -37,54 +42,68 @@ def _root(parents: Ints, cell: int) -> int:
 
 
 @device
-def _neighbouring_cells(keys: Ints, side_y: int, side_z: int) -> Ints:
-    """Pairs of occupied cells at most two cells apart along each axis, shape (K, 2), the lower index first."""
-    pairs, count = np.empty((16 * len(keys), 2), np.int64), 0
-    for x in range(3):
-        for y in range(-2 if x else 0, 3):
-            shift, first = (x * side_y + y) * side_z, 0
-            for cell in range(len(keys)):
-                while first < len(keys) and keys[first] < keys[cell] + shift - 2:
-                    first += 1
-                other = max(first, cell + 1)
-                while other < len(keys) and keys[other] <= keys[cell] + shift + 2:
-                    if count == len(pairs):
-                        pairs = np.concatenate((pairs, np.empty_like(pairs)))
-                    pairs[count, 0], pairs[count, 1] = cell, other
-                    count, other = count + 1, other + 1
-    return pairs[:count]
+def _neighbouring_cells(keys: Ints, side_x: int, side_y: int) -> Ints:
+    """Runs of occupied cells at most two cells apart along each axis, first index and end, shape (13, C, 2).
+
+    Each pair of cells is in one run only. A run lies along y, and its points follow each other.
+    """
+    runs = np.empty((len(_STEPS), len(keys), 2), np.int64)
+    for step, (z, x) in enumerate(_STEPS):
+        shift, first, end = (z * side_x + x) * side_y, 0, 0
+        for cell in range(len(keys)):
+            while first < len(keys) and keys[first] < keys[cell] + shift - 2:
+                first += 1
+            while end < len(keys) and keys[end] <= keys[cell] + shift + 2:
+                end += 1
+            runs[step, cell, 0], runs[step, cell, 1] = max(first, cell + 1), end
+    return runs
 
 
 @device
-def _find_core_points(points: Floats, begins: Ints, pairs: Ints, squared_radius: float, min_samples: int) -> Bools:
-    """Mask of the core points, shape (N,). Neighbours of a point are counted until it is known to be a core point."""
-    sizes = begins[1:] - begins[:-1]
-    neighbours = np.repeat(sizes, sizes)
-    for a, b in pairs:
-        if sizes[a] < min_samples or sizes[b] < min_samples:
-            for i in range(begins[a], begins[a + 1]):
-                for j in range(begins[b], begins[b + 1]):
-                    is_open = neighbours[i] < min_samples or neighbours[j] < min_samples
-                    if is_open and _is_near(points, i, j, squared_radius):
-                        neighbours[i] += 1
-                        neighbours[j] += 1
+def _find_core_points(points: Floats, begins: Ints, runs: Ints, squared_radius: float, min_samples: int) -> Bools:
+    """Mask of the core points, shape (N,). Neighbours are not counted where all points are known to be core points."""
+    sizes, count = begins[1:] - begins[:-1], points.shape[1]
+    neighbours, undecided = np.repeat(sizes, sizes), np.zeros(count + 1, np.int64)
+    for step in range(len(runs)):
+        for i in range(count):
+            undecided[i + 1] = undecided[i] + (neighbours[i] < min_samples)
+        for cell in range(len(sizes)):
+            first, end = runs[step, cell]
+            low, high, begin, stop = begins[first], begins[end], begins[cell], begins[cell + 1]
+            if low >= high or undecided[high] - undecided[low] + undecided[stop] - undecided[begin] == 0:
+                continue
+            for i in range(begin, stop):
+                near = 0
+                for j in range(low, high):
+                    is_near = _is_near(points, i, j, squared_radius)
+                    neighbours[j] += is_near
+                    near += is_near
+                neighbours[i] += near
     return neighbours >= min_samples
 
 
 @device
-def _join_cells(points: Floats, begins: Ints, pairs: Ints, squared_radius: float, core: Bools) -> Ints:
+def _has_core_neighbours(points: Floats, begins: Ints, a: int, b: int, squared_radius: float, core: Bools) -> bool:
+    """Check whether a core point of one cell is a neighbour of a core point of another."""
+    for i in range(begins[a], begins[a + 1]):
+        if core[i]:
+            for j in range(begins[b], begins[b + 1]):
+                if core[j] and _is_near(points, i, j, squared_radius):
+                    return True
+    return False
+
+
+@device
+def _join_cells(points: Floats, begins: Ints, runs: Ints, squared_radius: float, core: Bools) -> Ints:
     """Parent of each cell, shape (C,), in a forest with one tree for each cluster."""
     parents = np.arange(len(begins) - 1)
-    for a, b in pairs:
-        root, other, i = _root(parents, a), _root(parents, b), begins[a]
-        while i < begins[a + 1] and root != other:
-            j = begins[b]
-            while core[i] and j < begins[b + 1] and root != other:
-                if core[j] and _is_near(points, i, j, squared_radius):
+    for step in range(len(runs)):
+        for a in range(len(parents)):
+            root = _root(parents, a)
+            for b in range(runs[step, a, 0], runs[step, a, 1]):
+                other = _root(parents, b)
+                if other != root and _has_core_neighbours(points, begins, a, b, squared_radius, core):
                     parents[other] = root
-                    other = root
-                j += 1
-            i += 1
     return parents
 
 
@@ -107,9 +126,9 @@ def dbscan(points: Floats, eps: float, min_samples: int) -> Ints:
         for i in range(count):
             indices[i, axis] = math.floor((points[i, axis] - low) / side)
         sides[axis] = indices[:, axis].max() + 3  # two empty cells, so that steps do not lead to the next row
-    keys = (indices[:, 0] * sides[1] + indices[:, 1]) * sides[2] + indices[:, 2]
+    keys = (indices[:, 2] * sides[0] + indices[:, 0]) * sides[1] + indices[:, 1]
     order = argsort(keys, keys.max())
-    points, keys = points[order], keys[order]
+    points, keys = np.ascontiguousarray(points[order].T), keys[order]
     begins, cells, position, cell = np.empty(count + 1, np.int64), np.empty(count, np.int64), np.empty_like(order), -1
     for k in range(count):
         if k == 0 or keys[k] != keys[k - 1]:
@@ -119,9 +138,9 @@ def dbscan(points: Floats, eps: float, min_samples: int) -> Ints:
     begins[cell + 1] = count
     begins = begins[: cell + 2]
 
-    pairs = _neighbouring_cells(keys[begins[:-1]], sides[1], sides[2])
-    core = _find_core_points(points, begins, pairs, squared, min_samples)
-    parents = _join_cells(points, begins, pairs, squared, core)
+    runs = _neighbouring_cells(keys[begins[:-1]], sides[0], sides[1])
+    core = _find_core_points(points, begins, runs, squared, min_samples)
+    parents = _join_cells(points, begins, runs, squared, core)
     clusters, next_cluster = np.full(len(parents), count), 0  # not numbered yet
     for k in position:  # clusters are numbered by their lowest core point
         if core[k]:
@@ -133,14 +152,16 @@ def dbscan(points: Floats, eps: float, min_samples: int) -> Ints:
     found, has_border = clusters[cells], np.zeros(len(parents), np.bool_)
     for k in range(count):
         has_border[cells[k]] |= not core[k]
-    for a, b in pairs:
-        if not (has_border[a] or has_border[b]):
-            continue
-        for i in range(begins[a], begins[a + 1]):
-            for j in range(begins[b], begins[b + 1]):
-                if core[i] != core[j] and _is_near(points, i, j, squared):
-                    border, cluster = (j, clusters[a]) if core[i] else (i, clusters[b])
-                    found[border] = min(found[border], cluster)
+    for a in range(len(parents)):
+        for first, end in runs[:, a]:
+            for b in range(first, end):
+                if not (has_border[a] or has_border[b]):
+                    continue
+                for i in range(begins[a], begins[a + 1]):
+                    for j in range(begins[b], begins[b + 1]):
+                        if core[i] != core[j] and _is_near(points, i, j, squared):
+                            border, cluster = (j, clusters[a]) if core[i] else (i, clusters[b])
+                            found[border] = min(found[border], cluster)
     for k in range(count):
         if found[k] < count:
             labels[order[k]] = found[k]
