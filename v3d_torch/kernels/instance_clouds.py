@@ -18,6 +18,15 @@ of the depth of a body."""
 
 
 @device
+def _is_empty(row: Bools) -> bool:
+    """Check whether a row of a mask has no pixels; all of them are read, as a loop over vectors."""
+    found = False
+    for pixel in row:
+        found |= pixel
+    return not found
+
+
+@device
 def _select_object(labels: Ints, points: Floats32) -> Bools:
     """Mask of the points of the largest cluster and of other parts of the object, shape (N,).
 
@@ -61,6 +70,9 @@ def instance_cloud(
     height, width = depth.shape
     points, pixels, count, ray = np.empty((len(rays), 3), np.float32), np.empty((len(rays), 2), np.int64), 0, 0
     for row in range(0, height, stride):
+        if _is_empty(mask[row]):
+            ray += -(-width // stride)
+            continue
         for column in range(0, width, stride):
             z = depth[row, column]
             if mask[row, column] and z > 0 and z <= max_depth:
