@@ -27,6 +27,31 @@ def _is_empty(row: Bools) -> bool:
 
 
 @device
+def back_project(
+    depth: Floats32, mask: Bools, rays: Floats32, stride: int, max_depth: np.float32
+) -> tuple[Floats32, Ints]:
+    """Back-project every n-th pixel of a mask that has a depth: points, (P, 3), and their rows and columns, (P, 2).
+
+    The arguments are those of `instance_cloud`.
+    """
+    height, width = depth.shape
+    points, pixels, count, ray = np.empty((len(rays), 3), np.float32), np.empty((len(rays), 2), np.int64), 0, 0
+    for row in range(0, height, stride):
+        if _is_empty(mask[row]):
+            ray += -(-width // stride)
+            continue
+        for column in range(0, width, stride):
+            z = depth[row, column]
+            if mask[row, column] and z > 0 and z <= max_depth:
+                for axis in range(3):
+                    points[count, axis] = rays[ray, axis] * z
+                pixels[count, 0], pixels[count, 1] = row, column
+                count += 1
+            ray += 1
+    return points[:count], pixels[:count]
+
+
+@device
 def _select_object(labels: Ints, points: Floats32) -> Bools:
     """Mask of the points of the largest cluster and of other parts of the object, shape (N,).
 
@@ -68,24 +93,12 @@ def instance_cloud(
         Mean point of each voxel, metres, (M, 3), and mask of the voxels of the object, (M,).
     """
     height, width = depth.shape
-    points, pixels, count, ray = np.empty((len(rays), 3), np.float32), np.empty((len(rays), 2), np.int64), 0, 0
-    for row in range(0, height, stride):
-        if _is_empty(mask[row]):
-            ray += -(-width // stride)
-            continue
-        for column in range(0, width, stride):
-            z = depth[row, column]
-            if mask[row, column] and z > 0 and z <= max_depth:
-                for axis in range(3):
-                    points[count, axis] = rays[ray, axis] * z
-                pixels[count, 0], pixels[count, 1] = row, column
-                count += 1
-            ray += 1
-    means, _, voxels = pool_voxels(points[:count], voxel_size, np.inf)
+    points, pixels = back_project(depth, mask, rays, stride, max_depth)
+    means, _, voxels = pool_voxels(points, voxel_size, np.inf)
     if len(means) == 0:  # also if a point is not finite: it has no voxel
         return means, np.zeros(0, np.bool_)
     selected = _select_object(dbscan(means.astype(np.float64), eps, min_samples), means)
-    for i in range(count):
+    for i in range(len(points)):
         if selected[voxels[i]]:
             row, column = pixels[i]
             for v in range(row, min(row + stride, height)):
