@@ -13,8 +13,9 @@ from kornia.core.exceptions import ShapeError
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from v3d_torch.config import VotingConfig
 from v3d_torch.errors import ConfigError
-from v3d_torch.objects.voting import HoughVoting, hough_vote
+from v3d_torch.objects.voting import HoughVoting, hough_vote, vote_with_free_space
 
 Objects = dict[str, tuple[float, float, float]]
 
@@ -213,3 +214,23 @@ def test_threshold_that_is_a_tensor_moves_with_the_module() -> None:
 def test_text_of_the_module_has_its_settings() -> None:
     module = HoughVoting(torch.nn.Parameter(torch.tensor(0.5)), 2)
     assert repr(module) == "HoughVoting(distance_threshold=0.5, vote_threshold=2, temperature=None)"
+
+
+@pytest.mark.parametrize("is_checked", [True, False])
+@pytest.mark.parametrize("seed", range(5))
+def test_votes_with_free_space_of_a_batch_are_those_of_each_problem_alone(seed: int, is_checked: bool) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    previous = torch.rand(4, 7, 3, generator=generator, dtype=torch.float64)
+    current = previous + 0.05 * torch.randn(4, 7, 1, generator=generator, dtype=torch.float64)
+    present = torch.rand(4, 7, generator=generator) < torch.tensor([1.0, 0.7, 0.2, 0.0])[:, None]
+    moved = torch.rand(4, 7, generator=generator) < 0.5
+    together = vote_with_free_space(previous, current, moved if is_checked else None, VotingConfig(), present)
+    for k, rows in enumerate(present):
+        alone = vote_with_free_space(
+            previous[k, rows], current[k, rows], moved[k, rows] if is_checked else None, VotingConfig()
+        )
+        for found, expected in zip(together, alone, strict=True):
+            others = found[k].clone()
+            others[torch.meshgrid(*[rows.nonzero()[:, 0]] * expected.ndim, indexing="ij")] = 0
+            assert not others.any()
+            assert torch.equal(found[k][rows][..., rows] if expected.ndim == 2 else found[k][rows], expected)

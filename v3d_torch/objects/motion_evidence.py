@@ -156,30 +156,33 @@ def hough_vote_evidence(
     """
     if not config.enabled:
         return VoteEvidence({}, set(), [])
-    max_votes: dict[Track, int] = {}
-    dynamic: set[Track] = set()
-    vote_pairs: set[tuple[int, int]] = set()
-    for time_span in config.time_spans:
-        compared = pairs_by_span[time_span]
-        if time_span == 0:  # only objects of the previous frame are compared (Alg. 1)
-            compared = {track: pair for track, pair in compared.items() if pair[0].stamp >= previous_stamp}
-        if not compared:
-            continue
-        moved = None
-        if free_space.enabled:
-            moved = torch.tensor(
-                [free_space.allows_motion(track, earlier, MOVED_FRACTION) for track, (earlier, _) in compared.items()]
-            )
-        previous = torch.stack([earlier.centroid for earlier, _ in compared.values()])
-        current = torch.stack([newest.centroid for _, newest in compared.values()])
-        votes, is_dynamic, counted_votes = vote_with_free_space(previous, current, moved, config)
-        ids = [track.id for track in compared]
-        vote_pairs |= {(ids[voter], ids[candidate]) for candidate, voter in counted_votes.nonzero().tolist()}
-        for track, count, flag in zip(compared, votes.tolist(), is_dynamic.tolist(), strict=True):
-            max_votes[track] = max(max_votes.get(track, 0), count)
-            if flag:
-                dynamic.add(track)
-    return VoteEvidence(max_votes, dynamic, sorted(vote_pairs))
+    compared = [
+        # Over a time span of 0, only objects of the previous frame are compared (Alg. 1).
+        {track: pair for track, pair in pairs_by_span[span].items() if span > 0 or pair[0].stamp >= previous_stamp}
+        for span in config.time_spans
+    ]
+    tracks = list(dict.fromkeys(track for pairs in compared for track in pairs))
+    if not tracks:
+        return VoteEvidence({}, set(), [])
+    # One vote for all time spans at once, with a row for each object that is compared over any of them.
+    shape, unknown = (len(compared), len(tracks)), torch.zeros(3, dtype=torch.float64)
+    rows = [(track, pairs.get(track)) for pairs in compared for track in tracks]
+    previous, current = (
+        torch.stack([unknown if pair is None else pair[k].centroid for _, pair in rows]).view(*shape, 3) for k in (0, 1)
+    )
+    present = torch.tensor([pair is not None for _, pair in rows]).view(shape)
+    moved = None
+    if free_space.enabled:
+        moved = torch.tensor(
+            [pair is not None and free_space.allows_motion(track, pair[0], MOVED_FRACTION) for track, pair in rows]
+        ).view(shape)
+    votes, is_dynamic, counted_votes = vote_with_free_space(previous, current, moved, config, present)
+    pairs_of_votes = counted_votes.any(dim=0).nonzero().tolist()
+    return VoteEvidence(
+        votes=dict(zip(tracks, votes.amax(dim=0).tolist(), strict=True)),
+        dynamic={track for track, flag in zip(tracks, is_dynamic.any(dim=0).tolist(), strict=True) if flag},
+        vote_pairs=sorted((tracks[voter].id, tracks[candidate].id) for candidate, voter in pairs_of_votes),
+    )
 
 
 @dataclass(frozen=True)

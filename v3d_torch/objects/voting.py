@@ -117,7 +117,7 @@ def _pairwise_distances(centroids: Tensor, present: Tensor) -> Tensor:
 
 
 def vote_with_free_space(
-    previous: Tensor, current: Tensor, moved: Tensor | None, config: VotingConfig
+    previous: Tensor, current: Tensor, moved: Tensor | None, config: VotingConfig, present: Tensor | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Hough voting (paper, Alg. 1) with the free-space check as an additional voter and veto.
 
@@ -125,28 +125,33 @@ def vote_with_free_space(
     moved according to the free-space check, and has enough votes including the vote of the check.
 
     Args:
-        previous: Centroids of K objects at the earlier time, world frame, metres, shape :math:`(K, 3)`.
-        current: Centroids of the same objects at the current time, shape :math:`(K, 3)`.
-        moved: Mask of the objects that moved according to the free-space check, bool, shape :math:`(K,)`; None if the
-            check is disabled, for the rule of the paper.
+        previous: Centroids of K objects at the earlier time, world frame, metres, shape :math:`(..., K, 3)`.
+        current: Centroids of the same objects at the current time, shape :math:`(..., K, 3)`.
+        moved: Mask of the objects that moved according to the free-space check, bool, shape :math:`(..., K)`; None if
+            the check is disabled, for the rule of the paper.
         config: Thresholds.
+        present: Mask of the objects that are observed at both times, bool, shape :math:`(..., K)`; the others have no
+            votes. None for all.
 
     Returns:
-        Number of votes for each object, int64, shape :math:`(K,)`; mask of the dynamic objects, bool, shape
-        :math:`(K,)`; and the votes between objects that counted, of column j for row i, int64, shape :math:`(K, K)`.
+        Number of votes for each object, int64, shape :math:`(..., K)`; mask of the dynamic objects, bool, shape
+        :math:`(..., K)`; and the votes between objects that counted, of column j for row i, int64, shape
+        :math:`(..., K, K)`.
     """
-    present = torch.ones(previous.shape[0], dtype=torch.bool)
+    if present is None:
+        present = torch.ones(previous.shape[:-1], dtype=torch.bool)
     result = hough_vote(previous, current, present, config.distance_threshold, config.vote_threshold)
     pair = result.pair.to(torch.int64)
     if moved is None:
-        votes = pair.sum(dim=1)
-        return votes, votes >= config.vote_threshold, pair
-    may_vote = ~moved & ((current - previous).norm(dim=1) < _STATIC_VOTER_RATIO * config.distance_threshold)
-    pair = pair * may_vote
-    votes = pair.sum(dim=1) + moved
+        return pair.sum(dim=-1), result.dynamic, pair
+    moved = moved & present
+    is_static = (current - previous).norm(dim=-1) < _STATIC_VOTER_RATIO * config.distance_threshold
+    may_vote = present & ~moved & is_static
+    pair = pair * may_vote[..., None, :]
+    votes = pair.sum(dim=-1) + moved
     # The voters on a moved object are the objects that may vote, and the free-space check. If there are fewer voters
     # than the vote threshold, all of them must vote for the object.
-    voters = may_vote.sum() + 1
+    voters = may_vote.sum(dim=-1, keepdim=True) + 1
     return votes, moved & (votes >= voters.clamp(max=config.vote_threshold)), pair
 
 
