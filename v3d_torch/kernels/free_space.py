@@ -22,7 +22,7 @@ def _to_pixels(points: Floats, intrinsics: Intrinsics, pixels: Floats) -> None:
 
 
 @device
-def _compare(
+def compare(
     points: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds, limits: Limits, free: Floats
 ) -> None:
     """Compare points (x / z, y / z, z), (3, N), with a view: 1 in free space, 0 on a surface, NaN if unknown, (N,)."""
@@ -49,7 +49,7 @@ def _observe(
     for i in range(len(points)):
         x, y, z = transform(T_cw, points[i, 0], points[i, 1], points[i, 2])
         in_view[0, i], in_view[1, i], in_view[2, i] = x / z, y / z, z
-    _compare(in_view, nearest_depth, intrinsics, bounds, limits, free)
+    compare(in_view, nearest_depth, intrinsics, bounds, limits, free)
     return free
 
 
@@ -143,4 +143,4 @@ def was_free(
     for row in range(height):
         row_rays = rays[:, row * width : (row + 1) * width]
         _transform_row(depth[row * stride], stride, row_rays, T_wc, T_cw, limits, in_view)
-        _compare(in_view, nearest_depth, intrinsics, bounds, limits, result[row])
+        compare(in_view, nearest_depth, intrinsics, bounds, limits, result[row])

@@ -33,7 +33,8 @@ _VIEW_MARGIN = 0.2
 is at least as old as the time span can be one frame interval older."""
 
 
-def _limits(config: FreeSpaceConfig) -> kernels.Limits:
+def limits(config: FreeSpaceConfig) -> kernels.Limits:
+    """Return the range of depths and the tolerances for kernels."""
     return config.min_depth, config.max_depth, config.inverse_depth_tolerance, config.min_tolerance
 
 
@@ -41,9 +42,8 @@ def _observe_compiled(points: Tensor, view: SpaceView, camera: PinholeCamera, co
     if points.dtype != torch.float64:
         return NotImplemented
     pose, nearest_depth = to_array(view.T_dw), to_array(view.nearest_depth)
-    limits = _limits(config)
-    free = kernels.observe_free_space(points.numpy(), pose, nearest_depth, camera.intrinsics, camera.bounds, limits)
-    return torch.from_numpy(free)
+    observer = pose, nearest_depth, camera.intrinsics, camera.bounds, limits(config)
+    return torch.from_numpy(kernels.observe_free_space(points.numpy(), *observer))
 
 
 @compiled_by(_observe_compiled)
@@ -85,7 +85,7 @@ def _was_free_compiled(
     for row, previous in zip(was_free, earlier, strict=True):
         if previous is not None:
             pose, nearest_depth = to_array(previous.T_dw), to_array(previous.nearest_depth)
-            observer = pose, nearest_depth, camera.intrinsics, camera.bounds, _limits(config)
+            observer = pose, nearest_depth, camera.intrinsics, camera.bounds, limits(config)
             kernels.was_free(depth, stride, directions, T_wd, *observer, row)
     return torch.from_numpy(was_free)
 

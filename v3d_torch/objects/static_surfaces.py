@@ -7,6 +7,7 @@ Views of the last seconds often show this place.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,10 @@ from torch import Tensor
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import invert
+from v3d_torch.kernels import static_surfaces as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.depth_view import DepthView, StoredView
-from v3d_torch.objects.free_space_check import observe_free_space
+from v3d_torch.objects.free_space_check import limits, observe_free_space
 from v3d_torch.objects.stored_views import StoredViews
 from v3d_torch.types import STAMP_TOLERANCE
 
@@ -26,6 +29,61 @@ _TIME_SPAN = 3.0
 
 _INTERVAL = 0.5
 """Time between two views, seconds: a walking person moves by about the width of a person."""
+
+
+def _find_compiled(
+    view: DepthView,
+    pixels: Tensor,
+    stride: int,
+    earlier: Sequence[StoredView],
+    camera: PinholeCamera,
+    config: FreeSpaceConfig,
+) -> Tensor:
+    depth, rays, T_wd = to_array(view.depth[0]), to_array(camera.rays), to_array(invert(view.T_dw))
+    coarse = depth[::stride, ::stride]
+    is_candidate = pixels.numpy() & (coarse > config.min_depth) & (coarse <= config.max_depth)
+    free = np.where(is_candidate, np.nan, 1.0)
+    for each in reversed(earlier):
+        pose, nearest_depth = to_array(each.T_dw), to_array(each.nearest_depth)
+        observer = pose, nearest_depth, camera.intrinsics, camera.bounds, limits(config)
+        kernels.observe_unknown(depth, stride, rays, T_wd, *observer, free)
+    return torch.from_numpy(free == 0)
+
+
+@compiled_by(_find_compiled)
+def _find(
+    view: DepthView,
+    pixels: Tensor,
+    stride: int,
+    earlier: Sequence[StoredView],
+    camera: PinholeCamera,
+    config: FreeSpaceConfig,
+) -> Tensor:
+    """Find the pixels whose surface is a static one of an earlier view, see `StaticSurfaces.find`.
+
+    Args:
+        view: Current view.
+        pixels: Pixels to check, bool, shape (h, w).
+        stride: Step between the pixels, pixels.
+        earlier: Earlier views, oldest first.
+        camera: Camera of all views.
+        config: Range of depths and tolerances.
+    """
+    # NumPy is faster here than torch.
+    rows, columns = np.nonzero(pixels.numpy())
+    source = stride * rows, stride * columns
+    depth = view.depth[0].numpy()[source].astype(np.float64)
+    T_wd = invert(view.T_dw).numpy()
+    points = (camera.rays.numpy()[source] * depth[:, None]) @ T_wd[:3, :3].T + T_wd[:3, 3]
+    found = np.zeros(len(points), np.bool_)
+    unknown = np.flatnonzero((depth > config.min_depth) & (depth <= config.max_depth))
+    for each in reversed(earlier):
+        free = observe_free_space(torch.from_numpy(points[unknown]), each, camera, config).numpy()
+        found[unknown[free == 0]] = True
+        unknown = unknown[np.isnan(free)]
+    static = torch.zeros_like(pixels)
+    static.numpy()[rows, columns] = found
+    return static
 
 
 class StaticSurfaces(StoredViews):
@@ -54,24 +112,7 @@ class StaticSurfaces(StoredViews):
         Returns:
             Bool, shape :math:`(h, w)`.
         """
-        # NumPy is faster here than torch.
-        rows, columns = np.nonzero(pixels.numpy())
-        source = stride * rows, stride * columns
-        depth = view.depth[0].numpy()[source].astype(np.float64)
-        T_wd = invert(view.T_dw).numpy()
-        points = (self._camera.rays.numpy()[source] * depth[:, None]) @ T_wd[:3, :3].T + T_wd[:3, 3]
-        found = np.zeros(len(points), np.bool_)
-        unknown = np.flatnonzero((depth > self._config.min_depth) & (depth <= self._config.max_depth))
-        for earlier in reversed(self._views):
-            if not unknown.size:
-                break
-            of_unknown = torch.from_numpy(points[unknown])
-            free = observe_free_space(of_unknown, earlier, self._camera, self._config).numpy()
-            found[unknown[free == 0]] = True
-            unknown = unknown[np.isnan(free)]
-        static = torch.zeros_like(pixels)
-        static.numpy()[rows, columns] = found
-        return static
+        return _find(view, pixels, stride, self._views, self._camera, self._config)
 
     def add_view(self, view: DepthView, T_dw: Tensor, map_mask: Tensor) -> None:
         """Store the static part of a view if the last one is old enough, and drop views that are too old.

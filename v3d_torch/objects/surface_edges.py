@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from v3d_torch.kernels import surface_edges as kernels
+from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.objects.depth_view import erode_measured
 
 _REACH, _DIAGONAL_REACH = 3, 2
@@ -21,6 +23,13 @@ _MIN_BEND = 0.012
 length of 525 pixels, has 0.016 at any distance; the standard deviation on smoothed images of a Kinect is 0.005."""
 
 
+def _find_smooth_pixels_compiled(depth: NDArray[np.float32], stride: int, edge_ratio: float) -> NDArray[np.bool_]:
+    if depth.dtype != np.float32:
+        return NotImplemented
+    return kernels.find_smooth_pixels(np.ascontiguousarray(depth), stride, edge_ratio)
+
+
+@compiled_by(_find_smooth_pixels_compiled)
 def find_smooth_pixels(depth: NDArray[np.float32], stride: int, edge_ratio: float) -> NDArray[np.bool_]:
     """Check at every n-th pixel whether the depth within half the stride of it varies by less than ``edge_ratio``.
 
@@ -38,6 +47,13 @@ def find_smooth_pixels(depth: NDArray[np.float32], stride: int, edge_ratio: floa
     return np.asarray((centre > 0) & (farthest - nearest < edge_ratio * centre), np.bool_)
 
 
+def _find_concave_edges_compiled(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    if depth.dtype != np.float32:
+        return NotImplemented
+    return kernels.find_concave_edges(depth, _REACH, _DIAGONAL_REACH, _MIN_BEND)
+
+
+@compiled_by(_find_concave_edges_compiled)
 def find_concave_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Find the cells at which the depth bends towards the camera along rows, columns or diagonals.
 
