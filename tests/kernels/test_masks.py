@@ -1,4 +1,4 @@
-"""Kernels of masks, silhouettes and nearest depths equal their torch twins bitwise, on random and degenerate inputs."""
+"""Kernels of masks, surfaces, silhouettes and nearest depths equal their torch twins, on random and degenerate inputs."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.distortion import DistortionModel
+from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
-from v3d_torch.objects import mask_refiner, silhouette
+from v3d_torch.objects import mask_refiner, silhouette, static_surfaces, surface_edges
+from v3d_torch.objects.depth_view import DepthView, StoredView
 
 pytestmark = pytest.mark.skipif(not compiler.ENABLED, reason="numba is not installed, or V3D_KERNELS=torch is set")
 
@@ -43,6 +46,56 @@ def test_filled_surfaces_equal_their_twin(density: float, step: int) -> None:
     region = torch.from_numpy(rng.random((-(-45 // step), -(-62 // step))) < density)
     found, expected = (f(region, pixels, reachable, step, 0.4) for f in twin)
     assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("crop", [(0, 48, 0, 64), (8, 24, 16, 60), (40, 52, 60, 68)])
+@pytest.mark.parametrize("measured", [0.0, 0.7])
+@pytest.mark.parametrize("step", [1, 2, 4])
+@pytest.mark.parametrize("margin", [0, 8, 40])
+def test_agreeing_pixels_equal_their_twin(
+    crop: tuple[int, int, int, int], measured: float, step: int, margin: int
+) -> None:
+    rng = np.random.default_rng(0)
+    top, bottom, left, right = crop
+    part = slice(top, bottom), slice(left, right)
+    mask, cloud_pixels, agreeing = (torch.from_numpy(rng.random((48, 64)) < d) for d in (0.02, 0.01, 0.5))
+    static = torch.from_numpy(rng.random((-(-(bottom - top) // step), -(-(right - left) // step))) < 0.5)
+    depth = random_depth((48, 64), measured)[0]
+    found, expected = (
+        f(agreeing[part].contiguous(), depth, mask, cloud_pixels, part, static, step, margin)
+        for f in TWINS[f"{mask_refiner.__name__}._select_agreeing"]
+    )
+    assert torch.equal(found, expected)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("measured", [0.0, 0.7, 1.0])
+@pytest.mark.parametrize("step", [1, 3, 4])
+def test_edges_of_surfaces_equal_their_twins(size: tuple[int, int], measured: float, step: int) -> None:
+    depth, name = random_depth(size, measured)[0].numpy(), surface_edges.__name__
+    for edge_ratio in (0.04, 0.15):
+        np.testing.assert_array_equal(*(f(depth, step, edge_ratio) for f in TWINS[f"{name}.find_smooth_pixels"]))
+    for part in (depth, depth[::step, ::step]):
+        np.testing.assert_array_equal(*(f(part) for f in TWINS[f"{name}.find_concave_edges"]))
+
+
+@pytest.mark.parametrize("views", [0, 1, 3])
+@pytest.mark.parametrize(("density", "measured"), [(0.0, 1.0), (0.5, 0.0), (0.5, 0.7), (1.0, 1.0)])
+@pytest.mark.parametrize("step", [1, 3, 4])
+def test_static_surfaces_equal_their_twin(views: int, density: float, measured: float, step: int) -> None:
+    rng = np.random.default_rng(0)
+    camera = PinholeCamera(52.0, 52.0, 31.5, 23.5, 64, 48, distortion=(0.26, -0.95, -0.005, 0.003, 1.2))
+    poses = se3_exp(torch.from_numpy(rng.normal(0, 0.1, (views + 1, 6))))
+    scales = torch.from_numpy(rng.choice([0.7, 1.0, 1.3], (views, 48, 64)).astype(np.float32))
+    nearest = random_depth((48, 64), measured) * scales  # points are hidden, on a surface, or in free space
+    earlier = [StoredView(0.0, depth, pose) for depth, pose in zip(nearest, poses, strict=False)]
+    view = DepthView(1.0, random_depth((48, 64), measured), poses[-1])
+    pixels = torch.from_numpy(rng.random((-(-48 // step), -(-64 // step))) < density)
+    found, expected = (
+        f(view, pixels, step, earlier, camera, FreeSpaceConfig()) for f in TWINS[f"{static_surfaces.__name__}._find"]
+    )
+    assert torch.equal(found, expected)
+    assert bool(found.any()) is (views > 0 and density > 0 and measured > 0)
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.kernels import masks as kernels
-from v3d_torch.kernels.compiler import compiled_by
-from v3d_torch.objects.crops import crop_around
+from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.objects.crops import box_of, crop_around
 
 _MAX_COMPILED_RADIUS = 253
 """Maximum radius of the compiled dilation, pixels: the kernel stores distances up to the radius plus one as uint8."""
@@ -25,14 +25,13 @@ def ellipse(radius: int) -> NDArray[np.uint8]:
 
 
 def _dilate_compiled(mask: Tensor, pixels: int) -> Tensor:
-    if not 0 <= pixels <= _MAX_COMPILED_RADIUS:
+    heights = ellipse_heights(pixels)
+    if heights is None:
         return NotImplemented
-    source = mask.view(torch.uint8).numpy()
+    source = to_array(mask.view(torch.uint8))
     crop = crop_around(source, pixels)
-    dilated = np.zeros_like(source)
-    if crop is not None:
-        dilated[crop] = kernels.dilate(np.ascontiguousarray(source[crop]), ellipse_heights(pixels))
-    return torch.from_numpy(dilated).view(torch.bool)
+    box = (0, 0, 0, 0) if crop is None else box_of(crop, source.shape)
+    return torch.from_numpy(kernels.dilate(source, box, heights)).view(torch.bool)
 
 
 @compiled_by(_dilate_compiled)
@@ -55,6 +54,11 @@ def dilate(mask: Tensor, pixels: int) -> Tensor:
 
 
 @cache
-def ellipse_heights(radius: int) -> NDArray[np.uint8]:
-    """Height of `ellipse` above its centre, in each column from the centre to the right, pixels."""
+def ellipse_heights(radius: int) -> NDArray[np.uint8] | None:
+    """Height of the ellipse above its centre, in each column from the centre to the right, pixels, for kernels.
+
+    None if a kernel does not support the radius.
+    """
+    if not 0 <= radius <= _MAX_COMPILED_RADIUS:
+        return None
     return (ellipse(radius)[:, radius:].sum(axis=0) // 2).astype(np.uint8)

@@ -23,11 +23,11 @@ from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.kernels import masks as kernels
-from v3d_torch.kernels.compiler import compiled_by
+from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.appeared_pixels import AppearedPixels
-from v3d_torch.objects.crops import Crop, crop_around
+from v3d_torch.objects.crops import Crop, box_of, crop_around, widen
 from v3d_torch.objects.depth_view import DepthView
-from v3d_torch.objects.dilation import dilate, ellipse
+from v3d_torch.objects.dilation import dilate, ellipse, ellipse_heights
 from v3d_torch.objects.resampling import upsample_nearest
 from v3d_torch.objects.silhouette import CELL_SIZE, silhouettes
 from v3d_torch.objects.static_surfaces import StaticSurfaces
@@ -132,41 +132,40 @@ class MaskRefiner:
 
     def refine(self, track: Track) -> RefinedMask:
         """Return the refined mask of one of the objects."""
-        crop = crop_around(track.mask.view(torch.uint8).numpy(), self._reach, self._step)
-        if crop is None:
+        around = crop_around(track.mask.view(torch.uint8).numpy(), 0)
+        if around is None:
             nothing = np.zeros((0, 0), np.bool_)
             return RefinedMask((slice(0, 0), slice(0, 0)), nothing, nothing)
-        surface = self._surface(track, crop)
-        if track.missed or track not in self._silhouettes:
-            return RefinedMask(crop, surface, surface)
-        return RefinedMask(crop, surface, self._with_other_parts(track, surface, crop))
-
-    def _surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
-        """Return the pixels of an object in a part of the image that contains all of them, shape (h, w)."""
-        config, segmented, cloud_pixels = self._config, track.mask.numpy()[crop], track.cloud_pixels[crop]
+        crop = widen(around, self._reach, self._step)
         if track not in self._silhouettes:  # too few points for a depth range of the object
             # A predicted mask already agrees with the depth; without points it is the last one.
             is_predicted = track.missed and len(track.newest.cloud) > 0
-            return segmented if is_predicted else _dilate(segmented, config.depth_margin)
-        silhouette, tolerance = self._silhouettes[track][0], self._tolerance(track)
-        depth, origin = self._view.depth[:, *crop].contiguous(), (crop[0].start, crop[1].start)
-        reachable = silhouette.mask(depth, config.surface_margin, tolerance, origin=origin)
-        cells = self._cells(crop)
+            segmented = track.mask.numpy()[crop]
+            surface = segmented if is_predicted else _dilate(segmented, self._config.depth_margin)
+            return RefinedMask(crop, surface, surface)
         # A thing that moves now was a static surface before, but views are stored without people.
-        static = self._static_surface[cells] & (track.label == PERSON)
-        mask = self._grow_surface(segmented, cloud_pixels, reachable, static, cells)
+        static = self._static_surface if track.label == PERSON else np.zeros_like(self._concave)
+        surface = self._grow_surface(track, crop, static)
         if track.missed:  # a predicted mask already agrees with the depth
-            mask |= segmented
-            return mask
-        agreeing = silhouette.mask(depth, config.depth_margin, tolerance, origin=origin).numpy()
-        agreeing |= self._view.missing.numpy()[crop]
-        agreeing &= _dilate(segmented, config.depth_margin)
-        if static.any():
-            excluded = upsample_nearest(static, self._stride, mask.shape).numpy() > segmented
-            np.greater(agreeing, excluded, out=agreeing)  # a & ~b without a copy of b
-        mask |= agreeing
-        mask |= cloud_pixels.numpy()
-        return mask
+            surface |= track.mask.numpy()[crop]
+            return RefinedMask(crop, surface, surface)
+        near = widen(around, self._config.depth_margin, self._step)
+        near_surface = _part(surface, crop, near)
+        near_surface |= self._agreeing_pixels(track, near, static)
+        return RefinedMask(crop, surface, self._with_other_parts(track, surface, crop))
+
+    def _agreeing_pixels(self, track: Track, crop: Crop, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the pixels near an object's mask whose depth agrees with the object or is missing, bool, (h, w)."""
+        margin, cells = self._config.depth_margin, torch.from_numpy(static[self._cells(crop)])
+        agreeing, masks = self._near_silhouette(track, crop, margin), (track.mask, track.cloud_pixels)
+        return _select_agreeing(agreeing, self._view.depth[0], *masks, crop, cells, self._stride, margin).numpy()
+
+    def _near_silhouette(self, track: Track, crop: Crop, margin: int) -> Tensor:
+        """Return the pixels of a part of the image around an object's points with their depth, bool, (h, w)."""
+        # NumPy copies faster here than torch.
+        depth = torch.from_numpy(np.ascontiguousarray(self._view.depth.numpy()[:, *crop]))
+        origin = crop[0].start, crop[1].start
+        return self._silhouettes[track][0].mask(depth, margin, self._tolerance(track), origin=origin)
 
     def _tolerance(self, track: Track) -> float:
         """Return the maximum depth difference between a pixel and the points of an object around it, metres."""
@@ -199,24 +198,18 @@ class MaskRefiner:
         origin = crop[0].start, crop[1].start
         return silhouette.mask(depth, 0, self._tolerance(track), stride=self._stride, origin=origin).numpy()
 
-    def _grow_surface(
-        self,
-        segmented: NDArray[np.bool_],
-        cloud_pixels: Tensor,
-        reachable: Tensor,
-        static: NDArray[np.bool_],
-        cells: Crop,
-    ) -> NDArray[np.bool_]:
-        """Grow an object's pixels within the reachable ones up to the next edge or static surface, bool, (h, w)."""
-        if self._config.surface_margin == 0:
+    def _grow_surface(self, track: Track, crop: Crop, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Grow an object's pixels up to the next edge or static surface in a part of the image, bool, (h, w)."""
+        config, stride, cells = self._config, self._stride, self._cells(crop)
+        reachable, cloud_pixels = self._near_silhouette(track, crop, config.surface_margin), track.cloud_pixels[crop]
+        if config.surface_margin == 0:
             return (cloud_pixels & reachable).numpy()
-        stride = self._stride
         seeds = cloud_pixels.numpy()[::stride, ::stride]
-        near = _dilate(segmented[::stride, ::stride], self._config.surface_margin // stride)
+        near = _dilate(track.mask.numpy()[crop][::stride, ::stride], config.surface_margin // stride)
         near &= reachable.numpy()[::stride, ::stride]
-        near &= self._continuous[cells] & ~static
+        near &= self._continuous[cells] & ~static[cells]
         near |= seeds & ~self._concave[cells]
-        fraction = self._config.min_surface_fraction
+        fraction = config.min_surface_fraction
         return _fill_surfaces(torch.from_numpy(near), cloud_pixels, reachable, stride, fraction).numpy()
 
     def _cells(self, crop: Crop) -> Crop:
@@ -227,6 +220,14 @@ class MaskRefiner:
 
 def _dilate(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     return dilate(torch.from_numpy(np.ascontiguousarray(mask)), pixels).numpy()
+
+
+def _part(pixels: NDArray[np.bool_], crop: Crop, part: Crop) -> NDArray[np.bool_]:
+    """Return a part of the image from the pixels of a larger one."""
+    rows, columns = (
+        slice(inner.start - outer.start, inner.stop - outer.start) for inner, outer in zip(part, crop, strict=True)
+    )
+    return pixels[rows, columns]
 
 
 def _wide_parts(cells: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:
@@ -247,11 +248,10 @@ def _fill_surfaces_compiled(
     region: Tensor, pixels: Tensor, reachable: Tensor, stride: int, min_fraction: float
 ) -> Tensor:
     count, components, (rows, columns) = _components(region.view(torch.uint8).numpy())
-    seeds = np.ascontiguousarray(pixels.view(torch.uint8).numpy()[::stride, ::stride][rows, columns])
-    crop = slice(stride * rows.start, stride * rows.stop), slice(stride * columns.start, stride * columns.stop)
-    surface = np.zeros(reachable.shape, np.uint8)
-    in_crop = np.ascontiguousarray(reachable.view(torch.uint8).numpy()[crop])
-    surface[crop] = kernels.fill_components(components, count, seeds, in_crop, stride, min_fraction)
+    seeds = pixels.view(torch.uint8).numpy()[::stride, ::stride][rows, columns]
+    can_reach = to_array(reachable.view(torch.uint8))
+    surface, origin = np.zeros_like(can_reach), (stride * rows.start, stride * columns.start)
+    kernels.fill_components(components, count, seeds, can_reach, *origin, stride, min_fraction, surface)
     return torch.from_numpy(surface).view(torch.bool)
 
 
@@ -283,3 +283,54 @@ def _fill_surfaces(region: Tensor, pixels: Tensor, reachable: Tensor, stride: in
     cells = dilate(torch.from_numpy(selected[components]), 1).numpy()
     surface[crop] = upsample_nearest(cells, stride, in_crop.shape) & in_crop
     return surface
+
+
+def _select_agreeing_compiled(
+    agreeing: Tensor,
+    depth: Tensor,
+    mask: Tensor,
+    cloud_pixels: Tensor,
+    crop: Crop,
+    static: Tensor,
+    stride: int,
+    margin: int,
+) -> Tensor:
+    heights = ellipse_heights(margin)
+    if heights is None or depth.dtype != torch.float32:
+        return NotImplemented
+    agrees, own, on_object = (to_array(each.view(torch.uint8)) for each in (agreeing, mask, cloud_pixels))
+    box, cells = box_of(crop, depth.shape), static.view(torch.uint8).numpy()
+    selected = kernels.select_agreeing(agrees, to_array(depth), own, on_object, box, cells, stride, heights)
+    return torch.from_numpy(selected).view(torch.bool)
+
+
+@compiled_by(_select_agreeing_compiled)
+def _select_agreeing(
+    agreeing: Tensor,
+    depth: Tensor,
+    mask: Tensor,
+    cloud_pixels: Tensor,
+    crop: Crop,
+    static: Tensor,
+    stride: int,
+    margin: int,
+) -> Tensor:
+    """Select the pixels near the mask of an object that agree with the object or have no depth.
+
+    Args:
+        agreeing: Pixels of a part of the image whose depth agrees with the object's points, bool, shape :math:`(h, w)`.
+        depth: Depth, metres, float32, shape :math:`(H, W)`; 0 = no measurement.
+        mask: Network's mask of the object, bool, shape :math:`(H, W)`.
+        cloud_pixels: Pixels of the object's points; they are always selected, bool, shape :math:`(H, W)`.
+        crop: Rows and columns of the part, which begins at multiples of the stride.
+        static: Cells of the part that show static surfaces, bool; only the mask is selected there.
+        stride: Side of a cell, pixels.
+        margin: Radius by which the mask is dilated, pixels.
+
+    Returns:
+        Selected pixels of the part, bool, shape :math:`(h, w)`.
+    """
+    segmented = mask.numpy()[crop]
+    excluded = upsample_nearest(static.numpy(), stride, segmented.shape).numpy() & ~segmented
+    selected = (agreeing.numpy() | (depth.numpy()[crop] <= 0)) & _dilate(segmented, margin) & ~excluded
+    return torch.from_numpy(selected | cloud_pixels.numpy()[crop])

@@ -97,7 +97,8 @@ def _project(cloud: Tensor, camera: PinholeCamera) -> ProjectedCloud:
 
 
 def _minima_around_compiled(minima: Minima, radius: int) -> Minima:
-    return kernels.minima_around(minima, ellipse_heights(radius), _NO_DEPTH)
+    heights = ellipse_heights(radius)
+    return NotImplemented if heights is None else kernels.minima_around(minima, heights, _NO_DEPTH)
 
 
 @compiled_by(_minima_around_compiled)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import StaticMaskConfig
@@ -38,15 +39,18 @@ def static_masks(
         size: Height and width of the image.
         config: Margins of the masks.
     """
-    static_mask = _outside(excluded, size, config.dilation)
-    return StaticMasks(static_mask, static_mask & _outside(all_masks, size, config.map_dilation))
-
-
-def _outside(masks: Sequence[RefinedMask], size: torch.Size, dilation: int) -> Tensor:
-    """Return the pixels outside of all dilated masks, bool, shape (H, W)."""
-    if not masks:
-        return torch.ones(size, dtype=torch.bool)
     covered = np.zeros(size, np.bool_)
+    _add(excluded, covered)
+    static_mask = _outside(covered, config.dilation)
+    _add([each for each in all_masks if not any(each is other for other in excluded)], covered)
+    return StaticMasks(static_mask, static_mask & _outside(covered, config.map_dilation))
+
+
+def _add(masks: Sequence[RefinedMask], covered: NDArray[np.bool_]) -> None:
     for each in masks:
         covered[each.crop] |= each.mask
+
+
+def _outside(covered: NDArray[np.bool_], dilation: int) -> Tensor:
+    """Return the pixels outside of a dilated mask, bool, shape (H, W)."""
     return ~dilate(torch.from_numpy(covered), dilation)
