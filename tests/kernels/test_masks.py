@@ -1,4 +1,4 @@
-"""Kernels of masks, surfaces, silhouettes and nearest depths equal their torch twins, on random and degenerate inputs."""
+"""Kernels of masks, surfaces, silhouettes and depths equal their torch twins, on random and degenerate inputs."""
 
 from __future__ import annotations
 

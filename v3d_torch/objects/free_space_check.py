@@ -152,7 +152,7 @@ def _count_vacated_compiled(
         return NotImplemented
     points, ends = np.concatenate([to_array(cloud) for cloud in clouds]), np.cumsum([len(cloud) for cloud in clouds])
     pose, nearest_depth = to_array(view.T_dw), to_array(view.nearest_depth)
-    observer = pose, nearest_depth, camera.intrinsics, camera.bounds, _limits(config)
+    observer = pose, nearest_depth, camera.intrinsics, camera.bounds, limits(config)
     return kernels.count_free_points(points, ends, *observer)
 
 
