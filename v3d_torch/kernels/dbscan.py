@@ -42,12 +42,15 @@ def _root(parents: Ints, cell: int) -> int:
 
 
 @device
-def _neighbouring_cells(keys: Ints, side_x: int, side_y: int) -> Ints:
-    """Runs of occupied cells at most two cells apart along each axis, first index and end, shape (13, C, 2).
+def _neighbouring_cells(keys: Ints, side_x: int, side_y: int) -> tuple[Ints, Ints]:
+    """Runs of occupied cells at most two cells apart from a cell along each axis: the cell, first and end of its run.
 
     Each pair of cells is in one run only. A run lies along y, and its points follow each other.
+
+    Returns:
+        Runs, step by step, (K, 3), and the end of each step, (13,).
     """
-    runs = np.empty((len(_STEPS), len(keys), 2), np.int64)
+    runs, ends, count = np.empty((len(_STEPS) * len(keys), 3), np.int64), np.empty(len(_STEPS), np.int64), 0
     for step, (z, x) in enumerate(_STEPS):
         shift, first, end = (z * side_x + x) * side_y, 0, 0
         for cell in range(len(keys)):
@@ -55,22 +58,27 @@ def _neighbouring_cells(keys: Ints, side_x: int, side_y: int) -> Ints:
                 first += 1
             while end < len(keys) and keys[end] <= keys[cell] + shift + 2:
                 end += 1
-            runs[step, cell, 0], runs[step, cell, 1] = max(first, cell + 1), end
-    return runs
+            runs[count, 0], runs[count, 1], runs[count, 2] = cell, max(first, cell + 1), end
+            count += runs[count, 1] < end  # without a branch; an empty run is overwritten
+        ends[step] = count
+    return runs[:count], ends
 
 
 @device
-def _find_core_points(points: Floats, begins: Ints, runs: Ints, squared_radius: float, min_samples: int) -> Bools:
+def _find_core_points(
+    points: Floats, begins: Ints, runs: Ints, ends: Ints, squared_radius: float, min_samples: int
+) -> Bools:
     """Mask of the core points, shape (N,). Neighbours are not counted where all points are known to be core points."""
-    sizes, count = begins[1:] - begins[:-1], points.shape[1]
+    sizes, count, k = begins[1:] - begins[:-1], points.shape[1], 0
     neighbours, undecided = np.repeat(sizes, sizes), np.zeros(count + 1, np.int64)
-    for step in range(len(runs)):
+    for end_of_step in ends:
         for i in range(count):
             undecided[i + 1] = undecided[i] + (neighbours[i] < min_samples)
-        for cell in range(len(sizes)):
-            first, end = runs[step, cell]
+        while k < end_of_step:
+            cell, first, end = runs[k]
             low, high, begin, stop = begins[first], begins[end], begins[cell], begins[cell + 1]
-            if low >= high or undecided[high] - undecided[low] + undecided[stop] - undecided[begin] == 0:
+            k += 1
+            if undecided[high] - undecided[low] + undecided[stop] - undecided[begin] == 0:
                 continue
             for i in range(begin, stop):
                 near = 0
@@ -97,13 +105,12 @@ def _has_core_neighbours(points: Floats, begins: Ints, a: int, b: int, squared_r
 def _join_cells(points: Floats, begins: Ints, runs: Ints, squared_radius: float, core: Bools) -> Ints:
     """Parent of each cell, shape (C,), in a forest with one tree for each cluster."""
     parents = np.arange(len(begins) - 1)
-    for step in range(len(runs)):
-        for a in range(len(parents)):
-            root = _root(parents, a)
-            for b in range(runs[step, a, 0], runs[step, a, 1]):
-                other = _root(parents, b)
-                if other != root and _has_core_neighbours(points, begins, a, b, squared_radius, core):
-                    parents[other] = root
+    for a, first, end in runs:
+        root = _root(parents, a)
+        for b in range(first, end):
+            other = _root(parents, b)
+            if other != root and _has_core_neighbours(points, begins, a, b, squared_radius, core):
+                parents[other] = root
     return parents
 
 
@@ -138,8 +145,8 @@ def dbscan(points: Floats, eps: float, min_samples: int) -> Ints:
     begins[cell + 1] = count
     begins = begins[: cell + 2]
 
-    runs = _neighbouring_cells(keys[begins[:-1]], sides[0], sides[1])
-    core = _find_core_points(points, begins, runs, squared, min_samples)
+    runs, ends = _neighbouring_cells(keys[begins[:-1]], sides[0], sides[1])
+    core = _find_core_points(points, begins, runs, ends, squared, min_samples)
     parents = _join_cells(points, begins, runs, squared, core)
     clusters, next_cluster = np.full(len(parents), count), 0  # not numbered yet
     for k in position:  # clusters are numbered by their lowest core point
@@ -152,16 +159,15 @@ def dbscan(points: Floats, eps: float, min_samples: int) -> Ints:
     found, has_border = clusters[cells], np.zeros(len(parents), np.bool_)
     for k in range(count):
         has_border[cells[k]] |= not core[k]
-    for a in range(len(parents)):
-        for first, end in runs[:, a]:
-            for b in range(first, end):
-                if not (has_border[a] or has_border[b]):
-                    continue
-                for i in range(begins[a], begins[a + 1]):
-                    for j in range(begins[b], begins[b + 1]):
-                        if core[i] != core[j] and _is_near(points, i, j, squared):
-                            border, cluster = (j, clusters[a]) if core[i] else (i, clusters[b])
-                            found[border] = min(found[border], cluster)
+    for a, first, end in runs:
+        for b in range(first, end):
+            if not (has_border[a] or has_border[b]):
+                continue
+            for i in range(begins[a], begins[a + 1]):
+                for j in range(begins[b], begins[b + 1]):
+                    if core[i] != core[j] and _is_near(points, i, j, squared):
+                        border, cluster = (j, clusters[a]) if core[i] else (i, clusters[b])
+                        found[border] = min(found[border], cluster)
     for k in range(count):
         if found[k] < count:
             labels[order[k]] = found[k]
