@@ -37,19 +37,6 @@ def test_free_space_of_points_equals_its_twin(camera: PinholeCamera, measured: f
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("measured", [0.0, 0.8, 1.0])
-@pytest.mark.parametrize("sizes", [[0], [1], [700, 0, 1, 2000]])
-def test_vacated_points_of_clouds_equal_their_twin(camera: PinholeCamera, measured: float, sizes: list[int]) -> None:
-    rng = np.random.default_rng(0)
-    clouds = [torch.from_numpy(rng.normal(0, 2, (size, 3)).astype(np.float32)) for size in sizes]
-    clouds[-1][:1] = torch.nan
-    twin = TWINS[f"{free_space_check.__name__}._count_vacated"]
-    found, expected = (f(clouds, view(measured, 0.1), camera, FreeSpaceConfig()) for f in twin)
-    np.testing.assert_array_equal(found, expected)
-    assert twin.compiled([clouds[0].double()], view(measured, 0.1), camera, FreeSpaceConfig()) is NotImplemented
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
 @pytest.mark.parametrize("stride", [1, 4, 5])
 @pytest.mark.parametrize("measured", [0.0, 0.8])
 def test_pixels_in_space_that_was_free_equal_their_twin(camera: PinholeCamera, stride: int, measured: float) -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from v3d_torch.kernels.arrays import Floats, Floats32, Ints
+from v3d_torch.kernels.arrays import Floats, Floats32
 from v3d_torch.kernels.camera import Bounds, Intrinsics, distort, is_in_image
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.reprojection import transform
@@ -40,19 +40,6 @@ def compare(
                 free[i] = 1.0 if measured > z + tolerance else 0.0
 
 
-@device
-def _observe(
-    points: Floats | Floats32, T_cw: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds,
-    limits: Limits,
-) -> Floats:  # fmt: skip
-    free, in_view = np.empty(len(points)), np.empty((3, len(points)))
-    for i in range(len(points)):
-        x, y, z = transform(T_cw, points[i, 0], points[i, 1], points[i, 2])
-        in_view[0, i], in_view[1, i], in_view[2, i] = x / z, y / z, z
-    compare(in_view, nearest_depth, intrinsics, bounds, limits, free)
-    return free
-
-
 @kernel("(f8[:,:], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4))")
 def observe_free_space(
     points: Floats, T_cw: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds, limits: Limits
@@ -70,36 +57,12 @@ def observe_free_space(
     Returns:
         1 for free space, 0 for a surface, NaN if unknown, (P,).
     """
-    return _observe(points, T_cw, nearest_depth, intrinsics, bounds, limits)
-
-
-@kernel("(f4[:,::1], i8[::1], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4))")
-def count_free_points(
-    points: Floats32, ends: Ints, T_cw: Floats, nearest_depth: Floats32, intrinsics: Intrinsics, bounds: Bounds,
-    limits: Limits,
-) -> tuple[Ints, Ints]:  # fmt: skip
-    """Count the points of each cloud whose place a view observes.
-
-    Args:
-        points: Points of K clouds, one after the other, world frame, metres, (P, 3).
-        ends: End of each cloud, (K,).
-        T_cw: World-to-camera pose of the view, (4, 4).
-        nearest_depth: Minimum depth around each pixel, metres, (H, W); 0 for a pixel without depth.
-        intrinsics: Intrinsics of the camera.
-        bounds: Extent of the image.
-        limits: Range of depths and tolerances.
-
-    Returns:
-        Number of points in free space or on a surface, and number of those in free space, (K,) each.
-    """
-    free = _observe(points, T_cw, nearest_depth, intrinsics, bounds, limits)
-    known, vacated, begin = np.zeros(len(ends), np.int64), np.zeros(len(ends), np.int64), 0
-    for k, end in enumerate(ends):
-        for i in range(begin, end):
-            known[k] += free[i] >= 0  # false for NaN
-            vacated[k] += free[i] == 1
-        begin = end
-    return known, vacated
+    free, in_view = np.empty(len(points)), np.empty((3, len(points)))
+    for i in range(len(points)):
+        x, y, z = transform(T_cw, points[i, 0], points[i, 1], points[i, 2])
+        in_view[0, i], in_view[1, i], in_view[2, i] = x / z, y / z, z
+    compare(in_view, nearest_depth, intrinsics, bounds, limits, free)
+    return free
 
 
 @device

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig
@@ -141,31 +140,13 @@ def vacated_fractions(
     """
     if not clouds:
         return torch.zeros(0, dtype=torch.float64)
-    known, vacated = _count_vacated(clouds, view, camera, config)
-    return torch.from_numpy(np.where(known >= max(config.min_points, 1), vacated / np.maximum(known, 1), np.nan))
-
-
-def _count_vacated_compiled(
-    clouds: Sequence[Tensor], view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    if any(cloud.dtype != torch.float32 for cloud in clouds):
-        return NotImplemented
-    points, ends = np.concatenate([to_array(cloud) for cloud in clouds]), np.cumsum([len(cloud) for cloud in clouds])
-    pose, nearest_depth = to_array(view.T_dw), to_array(view.nearest_depth)
-    observer = pose, nearest_depth, camera.intrinsics, camera.bounds, limits(config)
-    return kernels.count_free_points(points, ends, *observer)
-
-
-@compiled_by(_count_vacated_compiled)
-def _count_vacated(
-    clouds: Sequence[Tensor], view: SpaceView, camera: PinholeCamera, config: FreeSpaceConfig
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the number of visible points of each cloud, and the number of those that have left, shape (K,) each."""
-    free = observe_free_space(torch.cat([cloud.to(torch.float64) for cloud in clouds]), view, camera, config).numpy()
+    points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
+    free = observe_free_space(points, view, camera, config).numpy()
     # NumPy counts faster here than torch.
     owner = np.arange(len(clouds)).repeat([len(cloud) for cloud in clouds])
-    known, vacated = (np.bincount(owner[mask], minlength=len(clouds)) for mask in (~np.isnan(free), free == 1))
-    return known, vacated
+    known = np.bincount(owner, ~np.isnan(free), len(clouds))
+    vacated = np.bincount(owner, free == 1, len(clouds))
+    return torch.from_numpy(np.where(known >= max(config.min_points, 1), vacated / np.maximum(known, 1), np.nan))
 
 
 class FreeSpaceCheck(StoredViews):
