@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from v3d_torch.kernels.arrays import Floats, Floats32
+from v3d_torch.kernels.arrays import Bools, Floats, Floats32, Ints
 from v3d_torch.kernels.camera import Bounds, Intrinsics
 from v3d_torch.kernels.compiler import kernel
 from v3d_torch.kernels.free_space import Limits, compare
@@ -13,13 +15,13 @@ from v3d_torch.kernels.reprojection import transform
 
 @kernel(
     "(f4[:,::1], i8, f4[:,:,::1], f8[:,::1], f8[:,::1], f4[:,::1], UniTuple(f8, 13), UniTuple(f8, 6), UniTuple(f8, 4),"
-    " f8[:,::1])"
+    " i8[::1], b1[:,::1])"
 )
-def observe_unknown(
+def find_static(
     depth: Floats32, stride: int, rays: Floats32, T_wc: Floats, T_cw: Floats, nearest_depth: Floats32,
-    intrinsics: Intrinsics, bounds: Bounds, limits: Limits, free: Floats,
-) -> None:  # fmt: skip
-    """Check whether a view observes the places of the pixels that are not known from other views as free.
+    intrinsics: Intrinsics, bounds: Bounds, limits: Limits, unknown: Ints, static: Bools,
+) -> Ints:  # fmt: skip
+    """Find the pixels whose surface another view observes.
 
     Args:
         depth: Depth of the current view, metres, (H, W).
@@ -31,16 +33,27 @@ def observe_unknown(
         intrinsics: Intrinsics of the camera.
         bounds: Extent of the image.
         limits: Range of depths and tolerances.
-        free: 1 for free space, 0 for a surface, NaN if unknown, for every n-th pixel, (h, w); written where unknown.
+        unknown: Indices of the pixels to check, among every n-th pixel, (P,).
+        static: Every n-th pixel whose surface is observed, (h, w); written.
+
+    Returns:
+        Indices of the pixels whose place the view does not observe, (Q,).
     """
-    rows, columns = np.nonzero(np.isnan(free))
-    in_view, observed = np.empty((3, len(rows))), np.empty(len(rows))
-    for i in range(len(rows)):
-        v, u = stride * rows[i], stride * columns[i]
+    found = static.ravel()
+    in_view, free = np.empty((3, len(unknown))), np.empty(len(unknown))
+    for i in range(len(unknown)):
+        row, column = divmod(unknown[i], static.shape[1])
+        v, u = stride * row, stride * column
         d = float(depth[v, u])
         x, y, z = transform(T_wc, rays[v, u, 0] * d, rays[v, u, 1] * d, rays[v, u, 2] * d)
         x, y, z = transform(T_cw, x, y, z)
         in_view[0, i], in_view[1, i], in_view[2, i] = x / z, y / z, z
-    compare(in_view, nearest_depth, intrinsics, bounds, limits, observed)
-    for i in range(len(rows)):
-        free[rows[i], columns[i]] = observed[i]
+    compare(in_view, nearest_depth, intrinsics, bounds, limits, free)
+    remaining, count = np.empty_like(unknown), 0
+    for i in range(len(unknown)):
+        if free[i] == 0:
+            found[unknown[i]] = True
+        elif math.isnan(free[i]):
+            remaining[count] = unknown[i]
+            count += 1
+    return remaining[:count]

@@ -42,12 +42,12 @@ def _find_compiled(
     depth, rays, T_wd = to_array(view.depth[0]), to_array(camera.rays), to_array(invert(view.T_dw))
     coarse = depth[::stride, ::stride]
     is_candidate = pixels.numpy() & (coarse > config.min_depth) & (coarse <= config.max_depth)
-    free = np.where(is_candidate, np.nan, 1.0)
+    unknown, static = np.flatnonzero(is_candidate), np.zeros(coarse.shape, np.bool_)
     for each in reversed(earlier):
         pose, nearest_depth = to_array(each.T_dw), to_array(each.nearest_depth)
         observer = pose, nearest_depth, camera.intrinsics, camera.bounds, limits(config)
-        kernels.observe_unknown(depth, stride, rays, T_wd, *observer, free)
-    return torch.from_numpy(free == 0)
+        unknown = kernels.find_static(depth, stride, rays, T_wd, *observer, unknown, static)
+    return torch.from_numpy(static)
 
 
 @compiled_by(_find_compiled)
