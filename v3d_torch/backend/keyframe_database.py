@@ -7,6 +7,7 @@ words.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import islice
 
 import faiss
 import numpy as np
@@ -37,6 +38,7 @@ class KeyframeDatabase:
     def _clear(self) -> None:
         self._index = faiss.IndexBinaryHash(_DESCRIPTOR_BITS, _KEY_BITS)
         self._descriptors: dict[int, Tensor] = {}  # by keyframe id, in the order of the index, with removed keyframes
+        self._indexed = 0  # number of keyframes in the index, see `index_keyframes`
         self._owner = np.zeros(0, dtype=np.int64)  # for each descriptor in the index, position of its keyframe
         self._removed: set[int] = set()
 
@@ -51,9 +53,14 @@ class KeyframeDatabase:
             keyframe: Id of the keyframe, not added before.
             descriptors: ORB descriptors of the keyframe, uint8, shape :math:`(N, 32)`.
         """
-        self._index.add(descriptors.contiguous().numpy())
-        self._owner = np.concatenate([self._owner, np.full(descriptors.shape[0], len(self._descriptors))])
         self._descriptors[keyframe] = descriptors
+
+    def index_keyframes(self) -> None:
+        """Add the descriptors of new keyframes to the index; `query` does so, too, but then takes longer."""
+        for position, own in islice(enumerate(self._descriptors.values()), self._indexed, None):
+            self._index.add(own.contiguous().numpy())
+            self._owner = np.concatenate([self._owner, np.full(own.shape[0], position)])
+        self._indexed = len(self._descriptors)
 
     def remove(self, keyframes: Iterable[int]) -> None:
         """Remove keyframes, given by their ids; ids that are not in the database are ignored."""
@@ -62,8 +69,7 @@ class KeyframeDatabase:
         if len(self._removed) > len(self):
             active = {index: own for index, own in self._descriptors.items() if index not in self._removed}
             self._clear()
-            for index, own in active.items():
-                self.add(index, own)
+            self._descriptors = active
 
     def query(self, descriptors: Tensor, k: int, exclude: Iterable[int] = ()) -> list[tuple[int, float]]:
         """Find the keyframes that most likely observe the same place.
@@ -77,6 +83,7 @@ class KeyframeDatabase:
             Pairs (id, score) with score > 0, best first; of equal scores, the keyframe added earlier is first. The
             score is divided by the number of descriptors. It ranks the keyframes of one query; it is not a probability.
         """
+        self.index_keyframes()
         ids = np.array(list(self._descriptors), dtype=np.int64)
         count, is_active = len(ids), ~np.isin(ids, list(self._removed))
         if len(self) == 0 or descriptors.shape[0] == 0:

@@ -98,6 +98,7 @@ class LoopCloser(StatefulComponent):
         self._database = KeyframeDatabase()
         for keyframe in keyframes:
             self.add_keyframe(keyframe)
+        self._database.index_keyframes()
 
     def relocalise(self, features: Features, sparse_map: SparseMap) -> PlaceMatch | None:
         """Find the place in the map at which an image was taken.
@@ -124,6 +125,7 @@ class LoopCloser(StatefulComponent):
         Returns:
             The loop and corrected poses; None if there is no loop or loop closing is disabled.
         """
+        self._database.index_keyframes()  # here, because tracking does not wait for it
         place = self._detect_revisit(keyframe, sparse_map) if self._config.enabled else None
         if place is None:
             return None
