@@ -99,11 +99,16 @@ class _Neighbourhood:
     def __init__(self, tables: MapTables, keyframes: list[int]) -> None:
         names = "keyframe", "landmark", "octave", "valid"
         keyframe, landmark, octave, valid = (tables.observations[name].numpy() for name in names)
-        self._keyframe_count, self._landmark_count = len(tables.keyframes), len(tables.landmarks)
-        usable = valid & tables.landmarks["active"].numpy()[landmark]
+        self._keyframe_count = len(tables.keyframes)
+        usable = valid & tables.landmarks["active"].numpy().take(landmark)
         by_keyframes = usable & contains(np.array(keyframes, np.int64), keyframe, self._keyframe_count)
-        rows = usable & contains(landmark[by_keyframes], landmark, self._landmark_count)
-        self._keyframe, self._octave, self._landmark = keyframe[rows], octave[rows], landmark[rows]
+        is_observed = np.zeros(len(tables.landmarks), np.bool_)
+        is_observed[landmark[np.flatnonzero(by_keyframes)]] = True
+        rows = np.flatnonzero(usable & is_observed.take(landmark))
+        # Number the observed landmarks only, so that time does not depend on the size of the map.
+        number = is_observed.cumsum() - 1
+        self._landmark_count = int(np.count_nonzero(is_observed))
+        self._keyframe, self._octave, self._landmark = keyframe[rows], octave[rows], number[landmark[rows]]
         self._levels = int(self._octave.max()) + 1 if len(self._octave) else 1
 
     def redundant_ratios(self, min_views: int) -> NDArray[np.float64]:
