@@ -17,6 +17,7 @@ from v3d_torch.mapping import landmark_ids
 from v3d_torch.mapping.covisibility import covisible_keyframes, landmarks_ever_observed
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.landmark_creation import create_landmarks, landmark_points, select_new_landmarks
+from v3d_torch.mapping.landmark_motion import move_landmarks
 from v3d_torch.mapping.map_tables import MapTables
 from v3d_torch.mapping.membership import contains
 from v3d_torch.odometry.rolling_shutter import Readout
@@ -142,16 +143,10 @@ class SparseMap(MapTables):
         T_cw[culled] = orthonormalise(
             previous[culled] @ invert(previous[references[culled]]) @ T_cw[references[culled]]
         )
-        T_new_old = (invert(T_cw) @ previous)[:, :3].flatten(1).T.numpy()
-        # Multiply element by element for all landmarks at once; faster than a small matrix product for each landmark.
-        owner = self.landmarks["keyframe"].numpy()
-        elements = np.stack([element.take(owner) for element in T_new_old]).reshape(3, 4, -1)
-        x, y, z = self.landmarks["point"].numpy().T.copy()
-        point = elements[:, 0] * x + elements[:, 1] * y + elements[:, 2] * z + elements[:, 3]
-        x, y, z = self.landmarks["direction"].numpy().T.copy()
-        direction = elements[:, 0] * x + elements[:, 1] * y + elements[:, 2] * z
-        self.landmarks["point"].numpy()[:] = point.T
-        self.landmarks["direction"].numpy()[:] = direction.T
+        table = self.landmarks
+        moved = move_landmarks(invert(T_cw) @ previous, table["keyframe"], table["point"], table["direction"])
+        for column, values in zip(("point", "direction"), moved, strict=True):
+            table[column].copy_(values)
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
