@@ -67,8 +67,8 @@ def _project_compiled(self: ProjectionMatcher, T_cw: Tensor, local_map: LocalMap
     columns = T_cw, local_map.points, local_map.directions, local_map.reference_distance
     if any(column.dtype != torch.float64 or column.requires_grad for column in columns):
         return NotImplemented
-    pose, points, directions, distances, K, bounds = map(to_array, (*columns, self._camera.K, self._bounds))
-    octaves = self._octaves[0], self._octaves[-1]
+    pose, points, directions, distances, K, bounds = map(to_array, (*columns, self._camera.K, self.bounds))
+    octaves = self.octaves[0], self.octaves[-1]
     projected = kernels.project(pose, points, directions, distances, K, bounds, math.log(self._scale), *octaves)
     return ProjectedLandmarks(*map(torch.from_numpy, projected))
 
@@ -80,19 +80,23 @@ class ProjectionMatcher:
         config: Thresholds of descriptor matching.
         features_config: Scale pyramid of the features.
         camera: Intrinsics.
+
+    Attributes:
+        octaves: Octaves of the levels of the scale pyramid.
+        bounds: Lower (inclusive) and upper bound of (z, u, v, cosine, octave) of a landmark in view, float64,
+            shape :math:`(2, 5)`.
     """
 
     def __init__(self, config: TrackingConfig, features_config: FeaturesConfig, camera: PinholeCamera) -> None:
         self._config = config
         self._scale = features_config.scale
-        self._octaves = octaves_of_levels(features_config, camera.width)
+        self.octaves = octaves_of_levels(features_config, camera.width)
         self._camera = camera
-        # Bounds of (z, u, v, cosine, octave) of a landmark in view; the lower bounds are inclusive.
         margin = _OCTAVE_MARGIN
         u_min, v_min, u_max, v_max = camera.undistorted_bounds
-        lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, self._octaves[0] - margin]
-        upper = [math.inf, u_max, v_max, math.inf, self._octaves[-1] + margin]
-        self._bounds = torch.tensor([lower, upper], dtype=torch.float64)
+        lower = [MIN_DEPTH, u_min, v_min, _MIN_COSINE, self.octaves[0] - margin]
+        upper = [math.inf, u_max, v_max, math.inf, self.octaves[-1] + margin]
+        self.bounds = torch.tensor([lower, upper], dtype=torch.float64)
 
     def __call__(
         self, features: Features, projection: ProjectedLandmarks, local_map: LocalMap, radius: float
@@ -142,8 +146,8 @@ class ProjectionMatcher:
         cosine = (points * directions).sum(dim=0) / distance
         octave = torch.log(local_map.reference_distance / distance) / math.log(self._scale)
         predicted = torch.stack([z, u, v, cosine, octave])
-        lower, upper = self._bounds[..., None]
+        lower, upper = self.bounds[..., None]
         rows = torch.nonzero(((predicted >= lower) & (predicted < upper)).all(dim=0))[:, 0]
         z, u, v, _, octave = predicted.index_select(1, rows)
-        nearest = octave.round().clamp(self._octaves[0], self._octaves[-1]).to(torch.int64)
+        nearest = octave.round().clamp(self.octaves[0], self.octaves[-1]).to(torch.int64)
         return ProjectedLandmarks(rows, torch.stack([u, v], dim=1), z, nearest)

@@ -11,7 +11,7 @@ from v3d_torch.features.matching import are_descriptors, as_words, hamming_dista
 from v3d_torch.kernels import projection_matching as projection_kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
 
-_CELL = 8.0
+CELL = 8.0
 """Side of the cells of the search grid, pixels: about half a search radius, so that few pixels are candidates."""
 
 _MAX_DISTANCE = 1 << 9
@@ -45,7 +45,7 @@ def _match_by_projection_compiled(
         as_words(descriptors),
         max_hamming,
         max_ratio,
-        _CELL,
+        CELL,
     )
     return torch.from_numpy(pairs)
 
@@ -140,7 +140,7 @@ def _pairs_within(
 def _cells(pixels: NDArray[np.float64]) -> NDArray[np.int64]:
     """Grid cells (column, row) of pixels relative to the grid's origin, both (2, N)."""
     with np.errstate(invalid="ignore"):  # nothing is near a projection that is NaN, whatever its cell
-        return np.floor(pixels / _CELL).astype(np.int64)
+        return np.floor(pixels / CELL).astype(np.int64)
 
 
 def _expand_ranges(first: NDArray[np.int64], last: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

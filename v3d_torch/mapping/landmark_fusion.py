@@ -7,23 +7,55 @@ depend on its own depth image alone.
 
 from __future__ import annotations
 
+from typing import Any, cast
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import Config
 from v3d_torch.features.features import to_measurements
+from v3d_torch.features.matching import as_words
 from v3d_torch.features.projection_matcher import ProjectionMatcher
+from v3d_torch.features.projection_search import CELL
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.geometry.se3 import transform_points
+from v3d_torch.kernels import landmark_fusion as kernels
+from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.membership import contains
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.optim.reprojection import chi_square, reprojection_residuals
+from v3d_torch.optim.reprojection import MIN_DEPTH, Measurements, chi_square, reprojection_residuals
 
 _SEARCH_RADIUS = 3.0
 """Search radius of the projection matching, pixels at octave 0 (ORB-SLAM2); small, because both poses are
 known."""
+
+
+def _find_matches_compiled(
+    self: LandmarkFusion, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe
+) -> Tensor:
+    features, table, config = keyframe.features, sparse_map.landmarks, self._config
+    measured = features.uv, features.depth, features.sigma_ratio, keyframe.T_cw
+    if any(column.dtype != torch.float64 or column.requires_grad for column in measured):
+        return NotImplemented
+    if len(features) == 0:
+        return torch.full_like(keyframe.landmarks, -1)
+    names = "active", "point", "direction", "reference_distance"
+    arrays = (
+        *map(to_array, (landmarks, keyframe.landmarks, *(table[name] for name in names))),
+        *map(as_words, (table["descriptor"], features.descriptors)),
+        *map(to_array, (features.octave, *measured, self._camera.K, self._match.bounds)),
+    )
+    settings = (
+        *(self._match.octaves[0], self._match.octaves[-1], config.features.scale),
+        *(_SEARCH_RADIUS, CELL, config.tracking.max_hamming, config.tracking.max_ratio),
+        *(config.tracking.pixel_sigma, config.tracking.inverse_depth_sigma, *self._chi2_thresholds, MIN_DEPTH),
+    )
+    matches: NDArray[np.int64] = cast("Any", kernels.find_matches)(*arrays, *settings)
+    return torch.from_numpy(matches)
 
 
 class LandmarkFusion:
@@ -38,6 +70,10 @@ class LandmarkFusion:
         self._config = config
         self._camera = camera
         self._match = ProjectionMatcher(config.tracking, config.features, camera)
+        depth = torch.tensor([0.0, 1.0], dtype=torch.float64)
+        uv = depth.new_zeros(2, 2)
+        either = Measurements(uv=uv, inverse_depth=depth, pixel_sigma=1.0, inverse_depth_sigma=1.0)
+        self._chi2_thresholds = either.chi2_threshold.tolist()  # of a feature without depth, and of one with depth
 
     def __call__(self, sparse_map: SparseMap, keyframe: Keyframe) -> None:
         """Match the landmarks of a keyframe in its neighbours, and the landmarks of the neighbours in the keyframe.
@@ -51,16 +87,27 @@ class LandmarkFusion:
         ).tolist()
         neighbours = [sparse_map.keyframes[index] for index in covisible if index != keyframe.index]
         for neighbour in neighbours:
-            self._fuse(sparse_map, keyframe.observed_landmarks, neighbour)
+            sparse_map.fuse_landmarks(neighbour, self._find_matches(sparse_map, keyframe.landmarks, neighbour))
         if neighbours:
-            landmarks = torch.cat([neighbour.observed_landmarks for neighbour in neighbours]).unique()
-            self._fuse(sparse_map, landmarks, keyframe)
+            landmarks = torch.cat([neighbour.landmarks for neighbour in neighbours])
+            sparse_map.fuse_landmarks(keyframe, self._find_matches(sparse_map, landmarks, keyframe))
 
-    def _fuse(self, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe) -> None:
-        """Match landmarks to features of a keyframe by projection, and fuse the matches."""
+    @compiled_by(_find_matches_compiled)
+    def _find_matches(self, sparse_map: SparseMap, landmarks: Tensor, keyframe: Keyframe) -> Tensor:
+        """Match landmarks that a keyframe does not observe to its features, by projection.
+
+        Args:
+            sparse_map: The map.
+            landmarks: Ids of landmarks, -1 for none, in any order, int64, shape :math:`(L,)`.
+            keyframe: Keyframe of the map.
+
+        Returns:
+            Id of the landmark matched to each feature of the keyframe, -1 for none, int64, shape :math:`(N,)`.
+        """
         features, config = keyframe.features, self._config
-        observed = contains(keyframe.observed_landmarks.numpy(), landmarks.numpy(), len(sparse_map.landmarks))
-        local = sparse_map.select_landmarks(landmarks[~torch.from_numpy(observed)].sort().values)
+        ids = landmarks[landmarks >= 0].unique()
+        observed = contains(keyframe.landmarks.numpy(), ids.numpy(), len(sparse_map.landmarks))
+        local = sparse_map.select_landmarks(ids[~torch.from_numpy(observed)])
         projected = self._match.project(keyframe.T_cw, local)
         row, feature = self._match(features, projected, local, _SEARCH_RADIUS).unbind(dim=1)
         # Reject matches by reprojection error, depth included.
@@ -72,4 +119,4 @@ class LandmarkFusion:
         )
         matches = torch.full_like(keyframe.landmarks, -1)
         matches[feature[inliers]] = local.ids[row[inliers]]
-        sparse_map.fuse_landmarks(keyframe, matches)
+        return matches

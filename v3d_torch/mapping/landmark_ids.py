@@ -6,8 +6,11 @@ from collections.abc import Iterable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.kernels import landmark_fusion as kernels
+from v3d_torch.kernels.compiler import compiled_by
 from v3d_torch.mapping.map_tables import MapTables
 
 _COMPACTION_RATIO = 2
@@ -29,25 +32,14 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
     keyframes, observed, features, valid = (
         tables.observations[name].numpy() for name in ("keyframe", "landmark", "feature", "valid")
     )
-    own, other, count = kept.numpy(), merged.numpy(), len(tables.landmarks)
-    new_id, affected = np.arange(count), np.zeros(count, dtype=np.bool_)
+    counts = len(tables.keyframes), len(tables.landmarks)
+    own, other = kept.numpy(), merged.numpy()
+    is_mergeable, rows = _find_mergeable(own, other, keyframes, observed, valid, *counts)
+    own, other = own[is_mergeable], other[is_mergeable]
+    new_id = np.empty(len(tables.landmarks), np.int64)
     new_id[other] = own
-    affected[own] = affected[other] = True
-    rows = np.flatnonzero(valid & affected.take(observed))
-    keyframe, landmark = keyframes[rows], observed[rows]
-
-    # If one keyframe observes both landmarks of a pair, they are distinct points.
-    keys = np.sort(keyframe * count + new_id[landmark])
-    is_distinct = np.zeros(count, dtype=np.bool_)
-    is_distinct[keys[1:][keys[1:] == keys[:-1]] % count] = True
-    distinct = is_distinct[own]
-    new_id[other[distinct]] = other[distinct]
-    own, other = own[~distinct], other[~distinct]
-
-    changed = new_id[landmark] != landmark
-    rows, keyframe, landmark = rows[changed], keyframe[changed], new_id[landmark[changed]]
+    keyframe, feature, landmark = keyframes[rows], features[rows], new_id[observed[rows]]
     observed[rows] = landmark
-    feature = features[rows]
     for index in np.flatnonzero(np.bincount(keyframe)):
         of_keyframe = keyframe == index
         tables.keyframes[index].landmarks.numpy()[feature[of_keyframe]] = landmark[of_keyframe]
@@ -55,6 +47,41 @@ def merge_landmarks(tables: MapTables, kept: Tensor, merged: Tensor) -> None:
         matches = tables.landmarks[counter].numpy()
         matches[own] += matches[other]
     tables.landmarks["active"].numpy()[other] = False
+
+
+@compiled_by(kernels.find_mergeable)
+def _find_mergeable(
+    kept: NDArray[np.int64],
+    merged: NDArray[np.int64],
+    keyframe: NDArray[np.int64],
+    landmark: NDArray[np.int64],
+    valid: NDArray[np.bool_],
+    keyframe_count: int,
+    landmark_count: int,
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Find the pairs of landmarks of which no keyframe observes both, and the observations of their second ones.
+
+    Args:
+        kept: Id of the first landmark of each pair, shape :math:`(P,)`.
+        merged: Id of the second landmark of each pair, shape :math:`(P,)`. No id occurs twice in ``kept`` and
+            ``merged``.
+        keyframe: Keyframe of each observation, shape :math:`(M,)`.
+        landmark: Landmark of each observation, shape :math:`(M,)`.
+        valid: Mask of the observations that are not outliers, shape :math:`(M,)`.
+        keyframe_count: Number of keyframes.
+        landmark_count: Number of landmarks.
+
+    Returns:
+        Mask of the pairs, shape :math:`(P,)`, and rows of the observations, ascending, shape :math:`(R,)`.
+    """
+    pair_of = np.full(landmark_count, -1)
+    pair_of[kept] = pair_of[merged] = np.arange(len(kept))
+    rows = np.flatnonzero(valid & (pair_of.take(landmark) >= 0))
+    pair = pair_of.take(landmark[rows])
+    keys = np.sort(pair * keyframe_count + keyframe[rows])
+    is_mergeable = np.ones(len(kept), np.bool_)
+    is_mergeable[keys[1:][keys[1:] == keys[:-1]] // keyframe_count] = False
+    return is_mergeable, rows[is_mergeable[pair] & (landmark[rows] == merged[pair])]
 
 
 def compact_landmarks(tables: MapTables, external_ids: Iterable[Tensor]) -> None:

@@ -10,7 +10,7 @@ def contains(ids: NDArray[np.int64], queries: NDArray[np.int64], count: int) -> 
     """Check which ids are in a set, by a lookup table because `numpy.isin` sorts.
 
     Args:
-        ids: Ids in the set, without -1, int64, shape :math:`(L,)`.
+        ids: Ids in the set, -1 for none, int64, shape :math:`(L,)`.
         queries: Ids to check, -1 for none, int64, shape :math:`(N,)`.
         count: Number of landmarks, or of keyframes, in the map: exclusive upper bound of the ids.
 
@@ -19,4 +19,5 @@ def contains(ids: NDArray[np.int64], queries: NDArray[np.int64], count: int) -> 
     """
     table = np.zeros(count + 1, dtype=np.bool_)  # index -1 is the last entry
     table[ids] = True
+    table[-1] = False
     return table.take(queries)

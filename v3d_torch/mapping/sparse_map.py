@@ -203,12 +203,16 @@ class SparseMap(MapTables):
             keyframe: Keyframe whose features were matched.
             landmarks: Id of the matched landmark of each feature, -1 for none, int64, shape :math:`(N,)`.
         """
-        observed = contains(keyframe.observed_landmarks.numpy(), landmarks.numpy(), len(self.landmarks))
-        matched = (landmarks >= 0) & ~torch.from_numpy(observed)
-        duplicate = matched & (keyframe.landmarks >= 0)
-        self._add_observations(keyframe, torch.nonzero(matched & ~duplicate)[:, 0], landmarks)
-        own, other = keyframe.landmarks[duplicate], landmarks[duplicate]
-        landmark_ids.merge_landmarks(self, torch.minimum(own, other), torch.maximum(own, other))
+        # NumPy is faster than torch for these small arrays.
+        own, matched = keyframe.landmarks.numpy(), landmarks.numpy()
+        features = np.flatnonzero(matched >= 0)
+        features = features[~contains(own, matched[features], len(self.landmarks))]
+        is_duplicate = own[features] >= 0
+        duplicates = features[is_duplicate]
+        own, other = own[duplicates], matched[duplicates]
+        self._add_observations(keyframe, torch.from_numpy(features[~is_duplicate]), landmarks)
+        pairs = np.minimum(own, other), np.maximum(own, other)
+        landmark_ids.merge_landmarks(self, *map(torch.from_numpy, pairs))
 
     def remove_observations(self, rows: Tensor) -> None:
         """Remove observations that a bundle adjustment found to be outliers.
@@ -225,16 +229,15 @@ class SparseMap(MapTables):
         """Add observations by some features of a keyframe, given the landmark ids of all its features."""
         if len(indices) == 0:
             return
-        features = keyframe.features
-        keyframe.landmarks[indices] = landmarks[indices]
+        landmarks = landmarks[indices]
+        keyframe.landmarks[indices] = landmarks
+        # index_select is faster than indexing here.
+        names = "uv", "readout_jacobian", "inverse_depth", "octave", "sigma_ratio"
+        columns = {name: getattr(keyframe.features, name).index_select(0, indices) for name in names}
         self.observations.append(
             keyframe=torch.full_like(indices, keyframe.index),
-            landmark=landmarks[indices],
+            landmark=landmarks,
             feature=indices,
-            uv=features.uv[indices],
-            readout_jacobian=features.readout_jacobian[indices],
-            inverse_depth=features.inverse_depth[indices],
-            octave=features.octave[indices],
-            sigma_ratio=features.sigma_ratio[indices],
+            **columns,
             valid=torch.ones_like(indices, dtype=torch.bool),
         )
