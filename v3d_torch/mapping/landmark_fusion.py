@@ -7,11 +7,9 @@ depend on its own depth image alone.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.config import Config
@@ -27,7 +25,13 @@ from v3d_torch.mapping.covisibility import covisible_keyframes
 from v3d_torch.mapping.keyframe import Keyframe
 from v3d_torch.mapping.membership import contains
 from v3d_torch.mapping.sparse_map import SparseMap
-from v3d_torch.optim.reprojection import MIN_DEPTH, Measurements, chi_square, reprojection_residuals
+from v3d_torch.optim.reprojection import (
+    CHI2_THRESHOLD_2D,
+    CHI2_THRESHOLD_3D,
+    MIN_DEPTH,
+    chi_square,
+    reprojection_residuals,
+)
 
 _SEARCH_RADIUS = 3.0
 """Search radius of the projection matching, pixels at octave 0 (ORB-SLAM2); small, because both poses are
@@ -44,18 +48,16 @@ def _find_matches_compiled(
     if len(features) == 0:
         return torch.full_like(keyframe.landmarks, -1)
     names = "active", "point", "direction", "reference_distance"
-    arrays = (
+    arguments: tuple[Any, ...] = (
         *map(to_array, (landmarks, keyframe.landmarks, *(table[name] for name in names))),
         *map(as_words, (table["descriptor"], features.descriptors)),
         *map(to_array, (features.octave, *measured, self._camera.K, self._match.bounds)),
-    )
-    settings = (
         *(self._match.octaves[0], self._match.octaves[-1], config.features.scale),
         *(_SEARCH_RADIUS, CELL, config.tracking.max_hamming, config.tracking.max_ratio),
-        *(config.tracking.pixel_sigma, config.tracking.inverse_depth_sigma, *self._chi2_thresholds, MIN_DEPTH),
+        *(config.tracking.pixel_sigma, config.tracking.inverse_depth_sigma),
+        *(CHI2_THRESHOLD_2D, CHI2_THRESHOLD_3D, MIN_DEPTH),
     )
-    matches: NDArray[np.int64] = cast("Any", kernels.find_matches)(*arrays, *settings)
-    return torch.from_numpy(matches)
+    return torch.from_numpy(kernels.find_matches(*arguments))
 
 
 class LandmarkFusion:
@@ -70,10 +72,6 @@ class LandmarkFusion:
         self._config = config
         self._camera = camera
         self._match = ProjectionMatcher(config.tracking, config.features, camera)
-        depth = torch.tensor([0.0, 1.0], dtype=torch.float64)
-        uv = depth.new_zeros(2, 2)
-        either = Measurements(uv=uv, inverse_depth=depth, pixel_sigma=1.0, inverse_depth_sigma=1.0)
-        self._chi2_thresholds = either.chi2_threshold.tolist()  # of a feature without depth, and of one with depth
 
     def __call__(self, sparse_map: SparseMap, keyframe: Keyframe) -> None:
         """Match the landmarks of a keyframe in its neighbours, and the landmarks of the neighbours in the keyframe.

@@ -28,7 +28,7 @@ from v3d_torch.runtime.batches import check_sigma, common_batch, fill_padding, t
 CHI2_THRESHOLD_2D = 5.991
 """95 % quantile of the chi-square distribution with 2 degrees of freedom: inlier threshold for (u, v)."""
 
-_CHI2_THRESHOLD_3D = 7.815
+CHI2_THRESHOLD_3D = 7.815
 """95 % quantile of the chi-square distribution with 3 degrees of freedom: inlier threshold for (u, v, 1/z)."""
 
 MIN_DEPTH = 0.05
@@ -62,7 +62,7 @@ class Measurements:
     def chi2_threshold(self) -> Tensor:
         """Chi-square threshold of an inlier (95 % quantile) for each measurement, shape :math:`(..., M)`."""
         threshold = torch.full_like(self.inverse_depth, CHI2_THRESHOLD_2D)
-        return threshold.masked_fill(self.inverse_depth > 0, _CHI2_THRESHOLD_3D)
+        return threshold.masked_fill(self.inverse_depth > 0, CHI2_THRESHOLD_3D)
 
 
 def prepare_measurements(
