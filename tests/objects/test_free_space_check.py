@@ -17,6 +17,7 @@ from torch import Tensor
 
 from v3d_torch.config import FreeSpaceConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import pack_masks
 from v3d_torch.geometry.se3 import invert, se3_exp
 from v3d_torch.objects import image_scale
 from v3d_torch.objects.appeared_pixels import AppearedPixels
@@ -352,7 +353,7 @@ def test_view_is_not_compared_with_itself() -> None:
 def test_disabled_check_compares_nothing() -> None:
     appeared_pixels = check_with(view(at=0.0), enabled=False)(view(WITH_BOX, at=0.9))
     assert appeared_pixels.was_free.shape == (0, 30, 40)
-    assert appeared_pixels.fractions([torch.ones(120, 160, dtype=torch.bool)], [1], [False]).shape == (1, 0)
+    assert appeared_pixels.fractions([pack_masks(torch.ones(30, 40, dtype=torch.bool))], [1], [False]).shape == (1, 0)
 
 
 def test_view_with_guessed_pose_is_not_compared() -> None:
@@ -454,7 +455,7 @@ def test_fraction_of_an_object_is_that_of_its_known_or_of_all_its_pixels(
     masks = [rng.random((7 * stride, 9 * stride)) < rng.random() for _ in range(3)]
     of_all = [bool(rng.random() < 0.5) for _ in masks]
     fractions = AppearedPixels(torch.from_numpy(appeared), stride).fractions(
-        [torch.from_numpy(mask) for mask in masks], 3 * [min_pixels], of_all
+        [pack_masks(torch.from_numpy(mask), stride) for mask in masks], 3 * [min_pixels], of_all
     )
     assert fractions.dtype == torch.float64 and fractions.shape == (3, rows)
     for row, mask, whole in zip(fractions, masks, of_all, strict=True):
@@ -473,9 +474,10 @@ def test_fraction_of_half_a_box_is_one_half() -> None:
     appeared_pixels = check_with(view(at=0.0))(view(WITH_BOX, at=0.3))
     mask = torch.zeros(120, 160, dtype=torch.bool)
     mask[40:80, 60:140] = True
-    (fractions,) = appeared_pixels.fractions([mask], [CONFIG.min_points], [False])
+    packed = pack_masks(mask, appeared_pixels.stride)
+    (fractions,) = appeared_pixels.fractions([packed], [CONFIG.min_points], [False])
     assert fractions[0] == 0.5 and fractions[1].isnan()
-    assert appeared_pixels.fractions([mask], [201], [False])[0, 0].isnan()
+    assert appeared_pixels.fractions([packed], [201], [False])[0, 0].isnan()
 
 
 # ---------------------------------------------------------------- state

@@ -672,7 +672,7 @@ def test_detections_over_the_longest_time_spans_are_compared_at_any_rate(
     """A detection that is older than a second is kept while no other is old enough."""
     jitters = jitter * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     mask, centroid = torch.zeros(1, 1, dtype=torch.bool), torch.zeros(3, dtype=torch.float64)
-    track = Track(1, 0.0, TrackerConfig(), mask, mask, torch.zeros(8, dtype=torch.uint8))
+    track = Track(1, 0.0, TrackerConfig(), mask, mask, *(torch.zeros(8, dtype=torch.uint8),) * 2)
     for number, noise in enumerate(jitters.tolist()):
         stamp = number / rate + noise
         track.add_detection(Detection3D(stamp, centroid, torch.zeros(5, 3)))
@@ -853,7 +853,7 @@ def test_what_the_first_frame_shows_moves_to_the_map_in_which_the_camera_is_foun
 @pytest.mark.parametrize("stamp", [-1e6, -10.0, 0.0, 1.7e9])
 def test_object_without_a_centroid_has_no_state_at_any_time(stamp: float) -> None:
     mask = torch.zeros(4, 4, dtype=torch.bool)
-    track = Track(1, stamp, TrackerConfig(), mask, mask, torch.zeros(2, dtype=torch.uint8))
+    track = Track(1, stamp, TrackerConfig(), mask, mask, *(torch.zeros(2, dtype=torch.uint8),) * 2)
     unknown = torch.full((3,), torch.nan, dtype=torch.float64)
     track.update_label(PERSON, 1.0)
     track.add_detection(Detection3D(stamp, unknown, torch.zeros(0, 3)))

@@ -26,7 +26,7 @@ def test_object_has_mostly_appeared_only_if_enough_of_its_pixels_are_known(label
     for count in (fewest - 1, fewest):
         mask = torch.zeros(120, 160, dtype=torch.bool)
         mask[:STRIDE, : STRIDE * count] = True
-        track = Track(1, 0.0, TrackerConfig(), mask, mask, pack_masks(mask))
+        track = Track(1, 0.0, TrackerConfig(), mask, mask, *(pack_masks(mask, STRIDE),) * 2)
         track.update_label(label, 0.0)
         evidence = free_space_evidence([track], {}, view, appeared, FreeSpaceConfig(), CAMERA)
         assert evidence.has_mostly_appeared(track) is (count == fewest)

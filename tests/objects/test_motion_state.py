@@ -23,7 +23,7 @@ AT_REST, MOVING, UNKNOWN = [0.02, 0.05], [0.02, 0.3], [math.nan, math.nan]
 def shifted_chair() -> Track:
     """Chair whose features moved against the camera motion at 1 s."""
     nothing = torch.zeros(0, 0, dtype=torch.bool)
-    track = Track(1, 0.0, CONFIG.tracker, nothing, nothing, torch.zeros(0, dtype=torch.uint8), label=CHAIR)
+    track = Track(1, 0.0, CONFIG.tracker, *(nothing,) * 2, *(torch.zeros(0, dtype=torch.uint8),) * 2, label=CHAIR)
     track.add_detection(Detection3D(0.0, torch.zeros(3, dtype=torch.float64), torch.rand(60, 3)))
     track.motion.last_shifted, track.motion.is_shifting = 1.0, True
     track.motion.mark_dynamic(1.0)
@@ -80,7 +80,7 @@ def test_features_show_a_motion_at_any_frame_rate(rate: float) -> None:
 def test_velocity_is_measured_anew_after_an_absence() -> None:
     """Someone who walked out of view and stands at the same place seconds later moved backwards."""
     nothing = torch.zeros(0, 0, dtype=torch.bool)
-    track = Track(1, 0.0, CONFIG.tracker, nothing, nothing, torch.zeros(0, dtype=torch.uint8), label=0)
+    track = Track(1, 0.0, CONFIG.tracker, *(nothing,) * 2, *(torch.zeros(0, dtype=torch.uint8),) * 2, label=0)
     for frame in range(30):
         place = torch.tensor([frame / 30, 0.0, 2.0], dtype=torch.float64)
         track.add_detection(Detection3D(frame / 30, place, torch.rand(60, 3)))

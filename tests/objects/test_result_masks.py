@@ -28,7 +28,7 @@ def box(rows: tuple[int, int], columns: tuple[int, int]) -> Tensor:
 
 def track_of(mask: Tensor, label: int = PERSON, *, missed: bool = False) -> Track:
     """Return a confirmed track with a mask."""
-    track = Track(1, 0.0, TrackerConfig(), mask, mask, pack_masks(mask), missed=missed)
+    track = Track(1, 0.0, TrackerConfig(), mask, mask, pack_masks(mask), pack_masks(mask), missed=missed)
     track.update_label(label, 0.9)
     track.add_detection(Detection3D(0.0, torch.zeros(3, dtype=torch.float64), torch.zeros(4, 3)))
     return track

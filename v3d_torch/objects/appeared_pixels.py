@@ -39,11 +39,11 @@ class AppearedPixels:
         """Pixels whose space was occupied over some time span and free over none, bool, shape :math:`(h, w)`."""
         return torch.from_numpy((self.was_free.numpy() == 0).any(axis=0) & ~self.appeared.numpy())
 
-    def fractions(self, masks: Sequence[Tensor], min_pixels: Sequence[int], of_all: Sequence[bool]) -> Tensor:
+    def fractions(self, packed: Sequence[Tensor], min_pixels: Sequence[int], of_all: Sequence[bool]) -> Tensor:
         """Return the fraction of each object's pixels that appeared.
 
         Args:
-            masks: Masks of K objects, bool, each of shape :math:`(H, W)`.
+            packed: Masks of K objects, packed with the stride (see `pack_masks`), uint8, each of shape :math:`(B',)`.
             min_pixels: Minimum number of known pixels of each object.
             of_all: True for a fraction of all pixels of the object, false for a fraction of the known ones; K elements.
 
@@ -51,9 +51,9 @@ class AppearedPixels:
             Fraction for each object and time span, NaN if too few pixels are known; float64, shape :math:`(K, B)`.
         """
         rows = len(self.was_free)
-        if not masks:
+        if not packed:
             return self.was_free.new_zeros(0, rows)
-        inside = torch.stack([pack_masks(mask, self.stride) for mask in masks])
+        inside = torch.stack(list(packed))
         indicators = pack_masks(torch.cat([self.was_free == 1, ~self.was_free.isnan()]))
         counts = count_common_pixels(inside, indicators).to(torch.float64)
         new, known = counts[:, :rows], counts[:, rows:]

@@ -158,7 +158,8 @@ class InstanceTracker(torch.nn.Module):
             track = matches.get(i)
             if track is None and (is_tiny[i] or self._is_duplicate(i, matches, detected)):
                 continue
-            masks = instances.masks[i], clouds.cloud_pixels[i], detected.coarse_masks[i]
+            pixels = instances.masks[i], clouds.cloud_pixels[i]
+            masks = *pixels, detected.coarse_masks[i], detected.coarse_surfaces[i]
             track = matches[i] = track or self._start_track(stamp, masks)
             track.add_detection(detection)
             track.set_masks(*masks, missed=False, is_shown=True)
@@ -277,7 +278,7 @@ class InstanceTracker(torch.nn.Module):
             for j in matches
         )
 
-    def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor]) -> Track:
+    def _start_track(self, stamp: float, masks: tuple[Tensor, Tensor, Tensor, Tensor]) -> Track:
         """Return a new track with the next id."""
         track = Track(self._next_id, stamp, self._config, *masks)
         self._next_id += 1
@@ -295,9 +296,9 @@ class InstanceTracker(torch.nn.Module):
         missed, resting, lost = [], list(self.resting), []
         has_depth = torch.from_numpy(depth[0].numpy() > 0)  # NumPy is faster here than torch
         unmatched = {i: track for i, track in enumerate(predicted.tracks) if track not in updated.values()}
-        coarse_masks = predicted.coarse_masks[list(unmatched)] & pack_masks(has_depth, self._stride)
-        covered = self._covered(list(unmatched.values()), coarse_masks, detected, updated)
-        for (i, track), is_covered in zip(unmatched.items(), covered, strict=True):
+        coarse_surfaces = predicted.coarse_masks[list(unmatched)] & pack_masks(has_depth, self._stride)
+        covered = self._covered(list(unmatched.values()), coarse_surfaces, detected, updated)
+        for (i, track), coarse_surface, is_covered in zip(unmatched.items(), coarse_surfaces, covered, strict=True):
             if not track.may_move:
                 track.drop_masks()
                 resting.append(track)
@@ -311,7 +312,8 @@ class InstanceTracker(torch.nn.Module):
             mask = predict_mask(track, predicted.silhouettes[i], depth, self._clouds.max_depth)
             is_recent = stamp - track.newest.stamp <= _MAX_SHOWN_TIME + STAMP_TOLERANCE
             is_shown = bool(predicted.visible[i]) and track.is_confirmed and is_recent
-            track.set_masks(mask, mask & has_depth, predicted.coarse_masks[i], missed=True, is_shown=is_shown)
+            masks = mask, mask & has_depth, predicted.coarse_masks[i], coarse_surface
+            track.set_masks(*masks, missed=True, is_shown=is_shown)
             missed.append(track)
         self._update_tracks_without_masks(stamp, resting, lost)
         return missed
@@ -329,7 +331,11 @@ class InstanceTracker(torch.nn.Module):
         self.lost = [track for track in candidates if stamp - track.newest.stamp <= max_age]
 
     def _covered(
-        self, tracks: Sequence[Track], coarse_masks: Tensor, detected: DetectedInstances, updated: Mapping[int, Track]
+        self,
+        tracks: Sequence[Track],
+        coarse_surfaces: Tensor,
+        detected: DetectedInstances,
+        updated: Mapping[int, Track],
     ) -> list[bool]:
         """Check for each track whether its predicted mask shows the surface of a detected track of the same class.
 
@@ -338,15 +344,15 @@ class InstanceTracker(torch.nn.Module):
 
         Args:
             tracks: T tracks.
-            coarse_masks: Their predicted coarse masks where there is depth, packed, shape (T, B).
+            coarse_surfaces: Their predicted coarse masks where there is depth, packed, shape (T, B).
             detected: Instances of the frame.
             updated: Tracks that were detected, by the index of the instance.
         """
         with_centroid = [i for i, track in updated.items() if track.newest.has_centroid]
         if not with_centroid or not tracks:
             return [False] * len(tracks)
-        common = count_common_pixels(coarse_masks, detected.coarse_surfaces[with_centroid])
-        is_over = common > _MIN_COVERED_FRACTION * count_pixels(coarse_masks)[:, None]
+        common = count_common_pixels(coarse_surfaces, detected.coarse_surfaces[with_centroid])
+        is_over = common > _MIN_COVERED_FRACTION * count_pixels(coarse_surfaces)[:, None]
         of_track, of_other = (
             torch.tensor([each.label for each in some]) for some in (tracks, [updated[i] for i in with_centroid])
         )

@@ -111,7 +111,7 @@ def free_space_evidence(
     # A far unlabelled region is smaller than other objects, but each of its pixels was new when it was proposed.
     least = min(config.min_points, MIN_REGION_SIDE**2)
     min_pixels = [least if track.label == UNLABELLED else config.min_points for track in tracks]
-    appeared = appeared_pixels.fractions([track.cloud_pixels for track in tracks], min_pixels, of_all)
+    appeared = appeared_pixels.fractions([track.coarse_surface for track in tracks], min_pixels, of_all)
     previous = list(dict.fromkeys(earlier for of_time_span in pairs.values() for earlier, _ in of_time_span.values()))
     vacated = vacated_fractions([detection.cloud for detection in previous], view, camera, config)
     return FreeSpaceEvidence(

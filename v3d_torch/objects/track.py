@@ -94,6 +94,7 @@ class Track:
         mask: Pixels of the object in the newest frame, bool, shape :math:`(H, W)`.
         cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
         coarse_mask: Every n-th pixel of the mask, for the tracker's overlaps, packed, uint8, shape :math:`(B,)`.
+        coarse_surface: Every n-th pixel of ``cloud_pixels``, packed, uint8, shape :math:`(B,)`.
         missed: True if the object was not detected in the newest frame, so that its masks are predicted.
         is_shown: True if results show the object: it was detected in the newest frame, or is confirmed, was missed for
             a short time only, and the depth shows it at its predicted position.
@@ -115,6 +116,7 @@ class Track:
     mask: Tensor
     cloud_pixels: Tensor
     coarse_mask: Tensor
+    coarse_surface: Tensor
     missed: bool = False
     is_shown: bool = True
     detections: list[Detection3D] = field(default_factory=list)
@@ -295,8 +297,8 @@ class Track:
 
     def drop_masks(self) -> None:
         """Drop the masks: the object is not detected, and not predicted either."""
-        nothing = torch.zeros(0, 0, dtype=torch.bool)
-        self.set_masks(nothing, nothing, torch.zeros(0, dtype=torch.uint8), missed=True, is_shown=False)
+        nothing, packed = torch.zeros(0, 0, dtype=torch.bool), torch.zeros(0, dtype=torch.uint8)
+        self.set_masks(nothing, nothing, packed, packed, missed=True, is_shown=False)
 
     def drop_old_detections(self) -> None:
         """Drop all but the newest detection: motion is not measured across a long absence."""
@@ -343,7 +345,14 @@ class Track:
             self.appearance_points += _APPEARANCE_RATE * (len(self.newest.cloud) - self.appearance_points)
 
     def set_masks(
-        self, mask: Tensor, cloud_pixels: Tensor, coarse_mask: Tensor, *, missed: bool, is_shown: bool
+        self,
+        mask: Tensor,
+        cloud_pixels: Tensor,
+        coarse_mask: Tensor,
+        coarse_surface: Tensor,
+        *,
+        missed: bool,
+        is_shown: bool,
     ) -> None:
         """Set the masks of the newest frame.
 
@@ -351,10 +360,12 @@ class Track:
             mask: Pixels of the object, bool, shape :math:`(H, W)`.
             cloud_pixels: Pixels of the mask whose depth belongs to the object, bool, shape :math:`(H, W)`.
             coarse_mask: Every n-th pixel of the mask, packed, uint8, shape :math:`(B,)`.
+            coarse_surface: Every n-th pixel of ``cloud_pixels``, packed, uint8, shape :math:`(B,)`.
             missed: True if the masks are predicted, because the object was not detected.
             is_shown: True if results show the object.
         """
-        self.mask, self.cloud_pixels, self.coarse_mask = mask, cloud_pixels, coarse_mask
+        self.mask, self.cloud_pixels = mask, cloud_pixels
+        self.coarse_mask, self.coarse_surface = coarse_mask, coarse_surface
         self.missed, self.is_shown = missed, is_shown
 
     def apply_world_correction(self, T_new_old: Tensor, since: float = -torch.inf) -> None:
