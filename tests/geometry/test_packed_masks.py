@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks, unpack_mask
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (8, 8), (120, 160), (67, 120)])
@@ -27,3 +27,10 @@ def test_one_mask_is_packed_alone() -> None:
 def test_every_nth_row_and_column_is_packed() -> None:
     masks = torch.rand(3, 21, 34, generator=torch.Generator().manual_seed(0)) < 0.5
     assert torch.equal(pack_masks(masks, 4), pack_masks(masks[:, ::4, ::4]))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (120, 160), (67, 121), (0, 4)])
+def test_unpacked_mask_is_the_mask(size: tuple[int, int]) -> None:
+    mask = torch.rand(size, generator=torch.Generator().manual_seed(0)) < 0.4
+    unpacked = unpack_mask(pack_masks(mask), size)
+    assert unpacked.dtype == torch.bool and torch.equal(unpacked, mask)

@@ -12,6 +12,7 @@ from v3d_torch.geometry.distortion import DistortionModel
 from v3d_torch.geometry.se3 import se3_exp
 from v3d_torch.kernels import compiler
 from v3d_torch.kernels.compiler import TWINS
+from v3d_torch.kernels.masks import Box
 from v3d_torch.objects import mask_refiner, silhouette, static_surfaces, surface_edges
 from v3d_torch.objects.depth_view import DepthView, StoredView
 
@@ -119,16 +120,20 @@ def test_counted_points_equal_their_twin(count: int) -> None:
 @pytest.mark.parametrize("step", [1, 3, 4])
 @pytest.mark.parametrize("first", [(0, 0), (-3, 2), (14, 9), (-20, -20), (40, 40)])
 @pytest.mark.parametrize("include_missing", [False, True])
-def test_selected_pixels_equal_their_twin(step: int, first: tuple[int, int], include_missing: bool) -> None:
+@pytest.mark.parametrize("box", [None, (3, 11, 2, 16), (5, 5, 4, 9)])
+def test_selected_pixels_equal_their_twin(
+    step: int, first: tuple[int, int], include_missing: bool, box: Box | None
+) -> None:
     rng = np.random.default_rng(0)
     nearest = rng.choice([1.5, 2.0, 1e6], (6, 8)).astype(np.float32)
     farthest = np.where(nearest < 1e6, nearest + rng.uniform(0, 0.1, (6, 8)), -1e6)
     minima = np.stack([nearest, -farthest], axis=-1).astype(np.float32)
     depth = random_depth((48, 64), 0.8)[:, ::step, ::step]
-    found, expected = (
-        f(minima, first, depth, 0.2, step, include_missing) for f in TWINS[f"{silhouette.__name__}._select_pixels"]
-    )
-    assert torch.equal(found, expected)
+    whole = 0, depth.shape[1], 0, depth.shape[2]
+    twin, (top, bottom, left, right) = TWINS[f"{silhouette.__name__}._select_pixels"], box or whole
+    found, expected = (f(minima, first, depth, box or whole, 0.2, step, include_missing) for f in twin)
+    everywhere = twin.torch(minima, first, depth, whole, 0.2, step, include_missing)
+    assert torch.equal(found, expected) and torch.equal(found, everywhere[top:bottom, left:right])
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,8 @@ def refine(
     cloud = (CAMERA.rays * depth[0][..., None])[seen & (depth[0] > 0)][::5]
     pixels = segmented & (depth[0] > 0)
     segmented[ROWS.start : CUT, COLUMNS.stop : COLUMNS.stop + beside] = True
-    track = Track(1, 0.0, TrackerConfig(), segmented, pixels, pack_masks(segmented), pack_masks(pixels), missed=missed)
+    packed = pack_masks(segmented, STEP), pack_masks(pixels, STEP)
+    track = Track(1, 0.0, TrackerConfig(), segmented, pixels, *packed, missed=missed)
     track.update_label(label, 0.9)
     if before is not None:
         earlier = (CAMERA.rays * depth[0][..., None])[before][::5]

@@ -191,7 +191,8 @@ def test_mask_of_a_part_of_the_image_is_that_part_of_the_mask(
 ) -> None:
     depth, part = board_and_wall(), (slice(*rows), slice(*columns))
     (silhouette,) = silhouettes([points(every=3)], CAMERA, SPACING)
-    found = silhouette.mask(depth[:, *part][:, ::step, ::step], 8, TOLERANCE, stride=step, origin=(rows[0], columns[0]))
+    crop = slice(rows[0] // step, rows[1] // step), slice(columns[0] // step, columns[1] // step)
+    found = silhouette.mask(depth[:, ::step, ::step], 8, TOLERANCE, stride=step, crop=crop)
     expected = silhouette.mask(depth, 8, TOLERANCE)[part][::step, ::step]
     assert found.any() and torch.equal(found, expected)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -24,6 +26,20 @@ def pack_masks(masks: Tensor, stride: int = 1) -> Tensor:
     packed = np.packbits(cells.reshape(*cells.shape[:-2], cells.shape[-2] * cells.shape[-1]), axis=-1)
     padding = -packed.shape[-1] % _WORD
     return torch.from_numpy(np.pad(packed, [(0, 0)] * (packed.ndim - 1) + [(0, padding)]) if padding else packed)
+
+
+def unpack_mask(packed: Tensor, size: Sequence[int]) -> Tensor:
+    """Unpack one mask.
+
+    Args:
+        packed: Packed mask, uint8, shape :math:`(B,)`.
+        size: Number of packed rows and columns, :math:`(h, w)`.
+
+    Returns:
+        Mask, bool, shape :math:`(h, w)`.
+    """
+    pixels = np.unpackbits(packed.numpy(), count=size[0] * size[1])
+    return torch.from_numpy(pixels.view(np.bool_).reshape(size[0], size[1]))
 
 
 def count_pixels(packed: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import numpy as np
 from v3d_torch.kernels.arrays import Bools, Bytes, Floats, Floats32, Ints
 from v3d_torch.kernels.camera import Bounds, Intrinsics, project_to_image
 from v3d_torch.kernels.compiler import device, kernel
+from v3d_torch.kernels.masks import Box
 
 
 @device
@@ -78,18 +79,21 @@ def minima_around(minima: Floats32, heights: Bytes, no_depth: float) -> Floats32
         Minimum of z and of -z around each cell, metres, (rows + 2 r, columns + 2 r, 2).
     """
     (rows, columns, _), radius = minima.shape, len(heights) - 1
-    values = minima.reshape(rows, 2 * columns)
-    around = np.full((rows + 2 * radius, 2 * (columns + 2 * radius)), no_depth, np.float32)
+    # All rows are one array: a loop over it is faster than one over each row. A shift by up to the radius moves only
+    # cells beside the given ones to another row, and these have no depth.
+    border, width = 2 * radius, 2 * (columns + 2 * radius)
+    padded = np.full((rows, width), no_depth, np.float32)
+    padded[:, border : width - border] = minima.reshape(rows, 2 * columns)
+    values, around = padded.ravel(), np.full((rows + 2 * radius) * width, no_depth, np.float32)
     # Minimum in a column of cells, from a height above each cell to the same height below it.
-    in_column = np.full((rows + 2 * radius, 2 * columns), no_depth, np.float32)
+    in_column = np.full(around.size + 2 * border, no_depth, np.float32)
     for height in range(radius + 1):
-        for y in range(rows):
-            _lower(values[y], in_column[y + radius - height])
-            _lower(values[y], in_column[y + radius + height])
+        above, below = (radius - height) * width, (radius + height) * width
+        _lower(values, in_column[border + above : border + above + values.size])
+        _lower(values, in_column[border + below : border + below + values.size])
         for x in range(2 * radius + 1):
             if heights[abs(x - radius)] == height:
-                for y in range(radius - height, radius + rows + height):
-                    _lower(in_column[y], around[y, 2 * x : 2 * (x + columns)])
+                _lower(in_column[2 * x + above : 2 * x + below + values.size], around[above : below + values.size])
     return around.reshape(rows + 2 * radius, columns + 2 * radius, 2)
 
 
@@ -105,35 +109,41 @@ def _add_missing(z: Floats32, low: Floats32, no_depth: float, inside: Bools) -> 
         inside[i] |= (z[i] <= 0) & (low[i] < no_depth)
 
 
-@kernel("(f4[:,:,::1], UniTuple(i8, 2), f4[:,::1], UniTuple(i8, 2), f4, f4)")
+@kernel("(f4[:,:,::1], UniTuple(i8, 2), f4[:,::1], UniTuple(i8, 4), UniTuple(i8, 2), f4, f4)")
 def select_pixels(
-    minima: Floats32, first: tuple[int, int], depth: Floats32, steps: tuple[int, int], tolerance: float, no_depth: float
-) -> Bools:
+    minima: Floats32, first: tuple[int, int], depth: Floats32, box: Box, steps: tuple[int, int], tolerance: float,
+    no_depth: float,
+) -> Bools:  # fmt: skip
     """Select the pixels whose depth lies within the range of their cell.
 
     Args:
         minima: Minimum of z and of -z around each cell, metres, (rows, columns, 2).
         first: Column and row of the first cell.
-        depth: Depth of every n-th pixel, metres, (h, w); 0 = no measurement.
+        depth: Depth of every n-th pixel, metres, (H, W); 0 = no measurement.
+        box: Rows and columns of ``depth`` in which pixels are selected.
         steps: Side of the cells in pixels, and n.
         tolerance: Tolerance of the depth, metres.
         no_depth: Pixels without depth are selected if the lower limit is below this depth, metres; 0 to select none.
 
     Returns:
-        Selected pixels, (h, w).
+        Selected pixels of the box, (h, w).
     """
-    (left, top), (cell, stride), mask = first, steps, np.zeros(depth.shape, np.bool_)
-    begin, end = max(-(-left * cell // stride), 0), min(-(-(left + minima.shape[1]) * cell // stride), depth.shape[1])
+    (left, top), (cell, stride), (top_row, bottom_row, left_column, right_column) = first, steps, box
+    mask = np.zeros((bottom_row - top_row, right_column - left_column), np.bool_)
+    begin = max(-(-left * cell // stride), left_column)
+    end = min(-(-(left + minima.shape[1]) * cell // stride), right_column)
     columns = np.arange(begin, max(begin, end)) * stride // cell - left
     low, high, previous = np.empty(len(columns), np.float32), np.empty(len(columns), np.float32), -1
-    for v in range(max(-(-top * cell // stride), 0), min(-(-(top + len(minima)) * cell // stride), len(depth))):
+    first_row, last_row = max(-(-top * cell // stride), top_row), -(-(top + len(minima)) * cell // stride)
+    for v in range(first_row, min(last_row, bottom_row)):
         row = v * stride // cell - top
         if row != previous:
             for i in range(len(columns)):
                 low[i] = minima[row, columns[i], 0] - tolerance
                 high[i] = tolerance - minima[row, columns[i], 1]
             previous = row
-        z, inside = depth[v, begin : begin + len(columns)], mask[v, begin : begin + len(columns)]
+        z = depth[v, begin : begin + len(columns)]
+        inside = mask[v - top_row, begin - left_column : begin - left_column + len(columns)]
         _compare(z, low, high, inside)
         if no_depth > 0:
             _add_missing(z, low, no_depth, inside)

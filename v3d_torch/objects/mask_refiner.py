@@ -21,6 +21,7 @@ from torch import Tensor
 
 from v3d_torch.config import ObjectsConfig
 from v3d_torch.geometry.camera import PinholeCamera
+from v3d_torch.geometry.packed_masks import unpack_mask
 from v3d_torch.geometry.se3 import transform_points
 from v3d_torch.kernels import masks as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
@@ -28,7 +29,7 @@ from v3d_torch.objects.appeared_pixels import AppearedPixels
 from v3d_torch.objects.crops import Crop, box_of, crop_around, widen
 from v3d_torch.objects.depth_view import DepthView
 from v3d_torch.objects.dilation import dilate, ellipse, ellipse_heights
-from v3d_torch.objects.resampling import upsample_nearest
+from v3d_torch.objects.resampling import subsample, upsample_nearest
 from v3d_torch.objects.silhouette import CELL_SIZE, silhouettes
 from v3d_torch.objects.static_surfaces import StaticSurfaces
 from v3d_torch.objects.surface_edges import find_concave_edges, find_smooth_pixels
@@ -97,9 +98,14 @@ class MaskRefiner:
         self._silhouettes = dict(zip(with_centroid, zip(projected, median_depths, strict=True), strict=True))
 
     @cached_property
+    def _depth(self) -> Tensor:
+        """Depth of every n-th pixel, metres, shape (1, h, w)."""
+        return subsample(self._view.depth, self._stride)
+
+    @cached_property
     def _concave(self) -> NDArray[np.bool_]:
         """Concave edges, at every n-th pixel."""
-        return find_concave_edges(self._view.depth[0].numpy()[:: self._stride, :: self._stride])
+        return find_concave_edges(self._depth[0].numpy())
 
     @cached_property
     def _was_occupied(self) -> NDArray[np.bool_]:
@@ -120,9 +126,8 @@ class MaskRefiner:
     @cached_property
     def _static_surface(self) -> NDArray[np.bool_]:
         """Every n-th pixel within reach of a person's mask whose surface an earlier view shows as static."""
-        masks = np.zeros(self._concave.shape, np.bool_)
-        for track in self._people:
-            masks |= track.mask.numpy()[:: self._stride, :: self._stride]
+        packed = np.bitwise_or.reduce([track.coarse_mask.numpy() for track in self._people])
+        masks = unpack_mask(torch.from_numpy(packed), self._concave.shape).numpy()
         if not len(self._appeared_pixels.was_free):  # the pose relative to earlier views is not known
             return np.zeros_like(masks)
         reachable = _dilate(masks, self._reach // self._stride) & self._continuous
@@ -162,10 +167,7 @@ class MaskRefiner:
 
     def _near_silhouette(self, track: Track, crop: Crop, margin: int) -> Tensor:
         """Return the pixels of a part of the image around an object's points with their depth, bool, (h, w)."""
-        # NumPy copies faster here than torch.
-        depth = torch.from_numpy(np.ascontiguousarray(self._view.depth.numpy()[:, *crop]))
-        origin = crop[0].start, crop[1].start
-        return self._silhouettes[track][0].mask(depth, margin, self._tolerance(track), origin=origin)
+        return self._silhouettes[track][0].mask(self._view.depth, margin, self._tolerance(track), crop=crop)
 
     def _tolerance(self, track: Track) -> float:
         """Return the maximum depth difference between a pixel and the points of an object around it, metres."""
@@ -190,13 +192,11 @@ class MaskRefiner:
 
     def _previous_surface(self, track: Track, crop: Crop) -> NDArray[np.bool_]:
         """Return every n-th pixel of a part of the image that shows the points of an object's previous detection."""
-        depth = self._view.depth[:, *crop][:, :: self._stride, :: self._stride]
-        cloud = track.predict_previous_cloud()
+        cells, cloud = self._cells(crop), track.predict_previous_cloud()
         if cloud is None:
-            return np.zeros(depth.shape[1:], np.bool_)
+            return np.zeros_like(self._concave[cells])
         silhouette = silhouettes([transform_points(self._view.T_dw, cloud)], self._camera, self._spacing)[0]
-        origin = crop[0].start, crop[1].start
-        return silhouette.mask(depth, 0, self._tolerance(track), stride=self._stride, origin=origin).numpy()
+        return silhouette.mask(self._depth, 0, self._tolerance(track), stride=self._stride, crop=cells).numpy()
 
     def _grow_surface(self, track: Track, crop: Crop, static: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Grow an object's pixels up to the next edge or static surface in a part of the image, bool, (h, w)."""

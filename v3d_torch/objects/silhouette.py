@@ -18,6 +18,8 @@ from torch import Tensor
 from v3d_torch.geometry.camera import PinholeCamera
 from v3d_torch.kernels import silhouette as kernels
 from v3d_torch.kernels.compiler import compiled_by, to_array
+from v3d_torch.kernels.masks import Box
+from v3d_torch.objects.crops import Crop, box_of
 from v3d_torch.objects.dilation import ellipse, ellipse_heights
 
 CELL_SIZE = 4
@@ -110,37 +112,50 @@ def _minima_around(minima: Minima, radius: int) -> Minima:
 
 
 def _select_pixels_compiled(
-    minima: Minima, first: tuple[int, int], depth: Tensor, tolerance: float, stride: int, include_missing: bool
+    minima: Minima,
+    first: tuple[int, int],
+    depth: Tensor,
+    box: Box,
+    tolerance: float,
+    stride: int,
+    include_missing: bool,
 ) -> Tensor:
     if depth.dtype != torch.float32:
         return NotImplemented
     no_depth = _NO_DEPTH / 2 if include_missing else 0.0
-    mask = kernels.select_pixels(minima, first, to_array(depth[0]), (CELL_SIZE, stride), tolerance, no_depth)
+    mask = kernels.select_pixels(minima, first, to_array(depth[0]), box, (CELL_SIZE, stride), tolerance, no_depth)
     return torch.from_numpy(mask)
 
 
 @compiled_by(_select_pixels_compiled)
 def _select_pixels(
-    minima: Minima, first: tuple[int, int], depth: Tensor, tolerance: float, stride: int, include_missing: bool
+    minima: Minima,
+    first: tuple[int, int],
+    depth: Tensor,
+    box: Box,
+    tolerance: float,
+    stride: int,
+    include_missing: bool,
 ) -> Tensor:
     """Select the pixels whose depth lies within the range of their cell.
 
     Args:
         minima: Minimum of z and of -z around each cell, metres, shape (rows, columns, 2).
         first: First cell (column, row).
-        depth: Depth of every n-th pixel, metres, shape (1, h, w); 0 = no measurement.
+        depth: Depth of every n-th pixel, metres, shape (1, H, W); 0 = no measurement.
+        box: Rows and columns of ``depth`` in which pixels are selected.
         tolerance: Tolerance of the depth, metres.
         stride: Step n between the pixels of ``depth``.
         include_missing: Include pixels without depth in cells near points.
 
     Returns:
-        Mask, bool, shape (h, w).
+        Mask of the box, bool, shape (h, w).
     """
-    mask = np.zeros(depth.shape[1:], np.bool_)
-    left, top = first
+    (left, top), (top_row, bottom_row, left_column, right_column) = first, box
+    mask = np.zeros((bottom_row - top_row, right_column - left_column), np.bool_)
     v, u = (
-        _pixels_of_cells(top, len(minima), stride, depth.shape[1]),
-        _pixels_of_cells(left, minima.shape[1], stride, depth.shape[2]),
+        _pixels_of_cells(top, len(minima), stride, top_row, bottom_row),
+        _pixels_of_cells(left, minima.shape[1], stride, left_column, right_column),
     )
     cell_rows = np.arange(v.start, v.stop) * stride // CELL_SIZE - top
     cell_columns = np.arange(u.start, u.stop) * stride // CELL_SIZE - left
@@ -153,7 +168,7 @@ def _select_pixels(
     inside = (z > low) & (z < high)
     if include_missing:
         inside |= (z <= 0) & (low < _NO_DEPTH / 2)
-    mask[v, u] = inside
+    mask[v.start - top_row : v.stop - top_row, u.start - left_column : u.stop - left_column] = inside
     return torch.from_numpy(mask)
 
 
@@ -204,30 +219,30 @@ class Silhouette:
         *,
         stride: int = 1,
         include_missing: bool = False,
-        origin: tuple[int, int] = (0, 0),
+        crop: Crop | None = None,
     ) -> Tensor:
         """Return the pixels near the points whose depth lies within the depth range of the surrounding points.
 
         Args:
-            depth: Depth of every n-th pixel of the image or of a part of it, metres, shape :math:`(1, h, w)`; 0 = no
-                measurement.
+            depth: Depth of every n-th pixel, metres, shape :math:`(1, H, W)`; 0 = no measurement.
             margin: Distance from the outermost points up to which pixels are included, pixels.
             tolerance: Tolerance of the depth in front of and behind the surrounding points, metres.
             stride: Step n between the pixels of ``depth``.
             include_missing: Include pixels near the points that have no depth.
-            origin: Row and column of the image at which ``depth`` begins, multiples of the stride and of `CELL_SIZE`.
+            crop: Rows and columns of ``depth`` for which the mask is computed; None for all.
 
         Returns:
-            Mask of the pixels of ``depth``, bool, shape :math:`(h, w)`; empty if no point is in the image.
+            Mask of these pixels, bool, shape :math:`(h, w)`; empty if no point is in the image.
         """
+        box = (0, depth.shape[1], 0, depth.shape[2]) if crop is None else box_of(crop, depth.shape[1:])
         if len(self._projected.z) == 0:
-            return torch.zeros(depth.shape[1:], dtype=torch.bool)
+            return torch.zeros(box[1] - box[0], box[3] - box[2], dtype=torch.bool)
         radius = max(round((margin + self._gap) / CELL_SIZE), 1)
         if radius not in self._around:
             self._around[radius] = _minima_around(self._projected.minima, radius)
-        (left, top), (first_row, first_column) = self._projected.first, origin
-        first = left - radius - first_column // CELL_SIZE, top - radius - first_row // CELL_SIZE
-        return _select_pixels(self._around[radius], first, depth, tolerance, stride, include_missing)
+        left, top = self._projected.first
+        first = left - radius, top - radius
+        return _select_pixels(self._around[radius], first, depth, box, tolerance, stride, include_missing)
 
     def visible_fraction(self, depth: Tensor) -> float:
         """Return the fraction of projected points whose depth is the measured depth.
@@ -250,7 +265,10 @@ class Silhouette:
         return _count_points(self._projected.cells, self._projected.z, depth, DEPTH_TOLERANCE)[1]
 
 
-def _pixels_of_cells(first: int, count: int, stride: int, size: int) -> slice:
-    """Return the range of every n-th pixel of ``count`` cells that start with the cell ``first``, along one axis."""
-    begin, end = max(-(-first * CELL_SIZE // stride), 0), min(-(-(first + count) * CELL_SIZE // stride), size)
+def _pixels_of_cells(first: int, count: int, stride: int, least: int, end: int) -> slice:
+    """Return the range of every n-th pixel of ``count`` cells that start with the cell ``first``, along one axis.
+
+    The range lies within the pixels from ``least`` to ``end`` (exclusive).
+    """
+    begin, end = max(-(-first * CELL_SIZE // stride), least), min(-(-(first + count) * CELL_SIZE // stride), end)
     return slice(begin, max(begin, end))
