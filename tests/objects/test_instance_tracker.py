@@ -294,7 +294,7 @@ def test_predicted_cloud_moves_like_the_predicted_state() -> None:
     start = track.predict_state(track.newest.stamp).position
     for seconds in (0.0, 0.3, 2.0):
         stamp = track.newest.stamp + seconds
-        (cloud,) = predict_clouds([track], stamp, torch.eye(4, dtype=torch.float64))
+        (cloud,) = predict_clouds([track], [track.predict_state(stamp)], torch.eye(4, dtype=torch.float64))
         motion = (cloud - track.newest.cloud).mean(dim=0)
         torch.testing.assert_close(motion, track.predict_state(stamp).position - start)
 
@@ -316,12 +316,13 @@ def test_clouds_are_predicted_together_in_the_camera_frame() -> None:
         tracks = track_boards(Board(-0.5 + 0.03 * frame), Board(0.6, width=0.2))
     T_cw = se3_exp(torch.tensor([0.1, 0.2, 0.3, 0.1, -0.2, 0.3], dtype=torch.float64))
     stamp = tracks[0].newest.stamp + 0.2
-    clouds = predict_clouds(tracks, stamp, T_cw)
+    states = [track.predict_state(stamp) for track in tracks]
+    clouds = predict_clouds(tracks, states, T_cw)
     assert len(tracks) == 2
-    for track, cloud in zip(tracks, clouds, strict=True):
-        world = track.newest.cloud.to(torch.float64) + track.predict_motion(stamp)
+    for track, state, cloud in zip(tracks, states, clouds, strict=True):
+        world = track.newest.cloud.to(torch.float64) + track.motion_to(state)
         torch.testing.assert_close(cloud, torch.stack([T_cw[:3, :3] @ point + T_cw[:3, 3] for point in world]))
-    assert predict_clouds([], stamp, T_cw) == []
+    assert predict_clouds([], [], T_cw) == []
 
 
 def test_partial_view_changes_the_prediction_less() -> None:

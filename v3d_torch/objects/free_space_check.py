@@ -140,7 +140,7 @@ def vacated_fractions(
     """
     if not clouds:
         return torch.zeros(0, dtype=torch.float64)
-    points = torch.cat([cloud.to(torch.float64) for cloud in clouds])
+    points = torch.cat(list(clouds)).to(torch.float64)
     free = observe_free_space(points, view, camera, config).numpy()
     # NumPy counts faster here than torch.
     owner = np.arange(len(clouds)).repeat([len(cloud) for cloud in clouds])

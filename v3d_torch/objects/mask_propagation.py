@@ -41,7 +41,8 @@ def propagate_instances(
         Instances with the ids and classes of the tracks, score 0 and empty boxes.
     """
     detected = [track for track in tracks if not track.missed and track.label != UNLABELLED]
-    projected = silhouettes(predict_clouds(detected, view.stamp, view.T_dw), camera, config.voxel_size)
+    states = [track.predict_state(view.stamp) for track in detected]
+    projected = silhouettes(predict_clouds(detected, states, view.T_dw), camera, config.voxel_size)
     masks = {
         track: mask
         for track, each in zip(detected, projected, strict=True)

@@ -92,7 +92,8 @@ class MaskRefiner:
         # Maximum distance of a refined mask from the network's; surfaces are grown and filled in steps of the stride.
         self._reach = max(self._config.surface_margin, self._config.depth_margin) + 2 * self._stride
         with_centroid = [track for track in tracks if track.newest.has_centroid]
-        clouds = predict_clouds(with_centroid, view.stamp, view.T_dw)
+        states = [track.predict_state(view.stamp) for track in with_centroid]
+        clouds = predict_clouds(with_centroid, states, view.T_dw)
         median_depths = [float(cloud[:, 2].median()) for cloud in clouds]
         projected = silhouettes(clouds, camera, self._spacing)
         self._silhouettes = dict(zip(with_centroid, zip(projected, median_depths, strict=True), strict=True))

@@ -286,5 +286,5 @@ def _world_attributes(track: Track, stamp: float) -> dict[str, Any]:
     return {
         "state": track.predict_visible_state(stamp),
         "history": tuple(track.history),
-        "cloud": cloud + track.predict_motion(stamp).to(cloud.dtype) if track.missed else cloud,
+        "cloud": cloud + track.motion_to(track.predict_state(stamp)).to(cloud.dtype) if track.missed else cloud,
     }

@@ -9,11 +9,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from v3d_torch.objects.crops import Crop
 from v3d_torch.objects.mask_refiner import RefinedMask
 from v3d_torch.objects.track import Track
 
 _MIN_OWN_FRACTION = 0.5
 """Minimum fraction of a predicted mask that shows no detected object of the class; otherwise the object is hidden."""
+
+_WHOLE_IMAGE: Crop = (slice(None), slice(None))
 
 
 def result_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask], missing: Tensor) -> list[Tensor]:
@@ -33,30 +36,35 @@ def result_masks(tracks: Sequence[Track], refined: Mapping[Track, RefinedMask], 
     # Only masks of these classes are changed.
     labels = {track.label for track in (*refined, *predicted)}
     detected = [track for track in tracks if not track.missed and track.label in labels]
-    segmented = _unions(detected, [track.mask.numpy() for track in detected])
+    segmented = _unions(detected, [_segmented(track, refined.get(track)) for track in detected], missing.shape)
     masks = {track: track.mask.numpy() for track in tracks if not track.missed}
     for track in (*detected, *predicted):
         masks[track] = _corrected(track, refined.get(track), segmented.get(track.label), missing.numpy())
     if predicted:
-        surfaces = _unions(detected, [_surface(track, refined.get(track)) for track in detected])
+        surfaces = _unions(detected, [_surface(track, refined.get(track)) for track in detected], missing.shape)
         for track in predicted:
             masks[track] = _visible_part(track, masks[track], surfaces.get(track.label))
-        behind = _unions(predicted, [masks[track] for track in predicted])
+        behind = _unions(predicted, [(_WHOLE_IMAGE, masks[track]) for track in predicted], missing.shape)
         for track in detected:
             if track.label in behind:
                 masks[track] = masks[track] & ~behind[track.label]
     return [torch.from_numpy(masks[track]) if track in masks else torch.zeros_like(missing) for track in tracks]
 
 
-def _unions(tracks: Sequence[Track], masks: Sequence[NDArray[np.bool_]]) -> dict[int, NDArray[np.bool_]]:
-    """Return the union of the masks of each class, shape (H, W), by class."""
-    unions: dict[int, NDArray[np.bool_]] = {}
-    for track, mask in zip(tracks, masks, strict=True):
-        if track.label in unions:
-            unions[track.label] |= mask
-        else:
-            unions[track.label] = mask.copy()
+def _unions(
+    tracks: Sequence[Track], parts: Sequence[tuple[Crop, NDArray[np.bool_]]], size: Sequence[int]
+) -> dict[int, NDArray[np.bool_]]:
+    """Return the union of the masks of each class, (H, W), by class; each mask is given in a part of the image."""
+    unions = {track.label: np.zeros(size, np.bool_) for track in tracks}
+    for track, (crop, mask) in zip(tracks, parts, strict=True):
+        unions[track.label][crop] |= mask
     return unions
+
+
+def _segmented(track: Track, refined: RefinedMask | None) -> tuple[Crop, NDArray[np.bool_]]:
+    """Return a part of the image that contains the mask of an object, and the pixels of the mask there."""
+    crop = _WHOLE_IMAGE if refined is None else refined.crop
+    return crop, track.mask.numpy()[crop]
 
 
 def _corrected(
@@ -73,14 +81,9 @@ def _corrected(
     return mask
 
 
-def _surface(track: Track, refined: RefinedMask | None) -> NDArray[np.bool_]:
-    """Return the pixels of an object without the other parts of its refined mask, shape (H, W)."""
-    own: NDArray[np.bool_] = track.mask.numpy()
-    if refined is None:
-        return own
-    surface = np.zeros_like(own)
-    surface[refined.crop] = refined.surface
-    return surface
+def _surface(track: Track, refined: RefinedMask | None) -> tuple[Crop, NDArray[np.bool_]]:
+    """Return a part of the image, and the pixels of an object there, without the other parts of its refined mask."""
+    return (_WHOLE_IMAGE, track.mask.numpy()) if refined is None else (refined.crop, refined.surface)
 
 
 def _visible_part(track: Track, mask: NDArray[np.bool_], surfaces: NDArray[np.bool_] | None) -> NDArray[np.bool_]:

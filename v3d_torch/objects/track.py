@@ -214,16 +214,16 @@ class Track:
         """
         return self._predict(self._filter.visible_state, stamp)
 
-    def predict_motion(self, stamp: float) -> Tensor:
-        """Predict how far the newest cloud moves: like the position in `predict_state`.
+    def motion_to(self, state: ObjectState) -> Tensor:
+        """Return how far the newest cloud moves: like the position.
 
         Args:
-            stamp: Timestamp, seconds.
+            state: Predicted state, see `predict_state`.
 
         Returns:
             Translation, world frame, metres, float64, shape :math:`(3,)`; 0 before the first centroid.
         """
-        motion = self.predict_state(stamp).position - self.predict_state(self.newest.stamp).position
+        motion = state.position - self.predict_state(self.newest.stamp).position
         return motion.nan_to_num(0.0)
 
     def predict_unobserved_state(self, stamp: float) -> ObjectState:
@@ -400,12 +400,12 @@ class Track:
         return state.predict_with_decay(stamp, _VELOCITY_TIME) if self.may_move else state.predict_at_rest(stamp)
 
 
-def predict_clouds(tracks: Sequence[Track], stamp: float, T_cw: Tensor) -> list[Tensor]:
-    """Predict the clouds of tracks in the frame of a camera, see `Track.predict_motion`.
+def predict_clouds(tracks: Sequence[Track], states: Sequence[ObjectState], T_cw: Tensor) -> list[Tensor]:
+    """Predict the clouds of tracks in the frame of a camera, see `Track.motion_to`.
 
     Args:
         tracks: Tracks.
-        stamp: Timestamp, seconds.
+        states: Predicted state of each, see `Track.predict_state`.
         T_cw: World-to-camera pose, float64, shape :math:`(4, 4)`.
 
     Returns:
@@ -415,7 +415,7 @@ def predict_clouds(tracks: Sequence[Track], stamp: float, T_cw: Tensor) -> list[
         return []
     clouds = [track.newest.cloud for track in tracks]
     counts = [len(cloud) for cloud in clouds]
-    motions = torch.stack([track.predict_motion(stamp) for track in tracks])
+    motions = torch.stack([track.motion_to(state) for track, state in zip(tracks, states, strict=True)])
     return list(_transform_moved(torch.cat(clouds), counts, motions, T_cw).split(counts))
 
 

@@ -69,6 +69,7 @@ class PredictedTracks:
 
     Attributes:
         tracks: T tracks.
+        states: State of each track at the time of the frame.
         silhouettes: Projection of the newest cloud of each track at its predicted position.
         coarse_masks: Every n-th pixel of the predicted masks, packed, uint8, shape :math:`(T, B)`.
         visible_fractions: Fraction of the predicted points whose depth is the measured depth, float64, shape
@@ -76,6 +77,7 @@ class PredictedTracks:
     """
 
     tracks: Sequence[Track]
+    states: Sequence[ObjectState]
     silhouettes: Sequence[Silhouette]
     coarse_masks: Tensor
     visible_fractions: Tensor
@@ -131,7 +133,8 @@ def predict_tracks(
         config: Spacing and maximum depth of the points of the clouds.
         stride: Step between the coarse pixels, pixels.
     """
-    projected = silhouettes(predict_clouds(tracks, stamp, T_cw), camera, config.voxel_size)
+    states = [track.predict_state(stamp) for track in tracks]
+    projected = silhouettes(predict_clouds(tracks, states, T_cw), camera, config.voxel_size)
     coarse_depth = subsample(depth, stride)
     masks = [
         predict_mask(track, each, coarse_depth, config.max_depth, stride=stride)
@@ -139,6 +142,7 @@ def predict_tracks(
     ]
     return PredictedTracks(
         tuple(tracks),
+        states,
         projected,
         pack_masks(torch.stack(masks) if masks else torch.zeros(0, *coarse_depth.shape[1:], dtype=torch.bool)),
         torch.tensor([each.visible_fraction(depth) for each in projected], dtype=torch.float64),
@@ -166,8 +170,7 @@ def compare_tracks(
     tracks, stamp, count = [*predicted.tracks, *without_masks], detected.stamp, len(predicted.tracks)
     if not tracks:
         return torch.zeros(0, len(detected), dtype=torch.float64)
-    states = [track.predict_state(stamp) for track in predicted.tracks]
-    states += [track.predict_unobserved_state(stamp) for track in without_masks]
+    states = [*predicted.states, *(track.predict_unobserved_state(stamp) for track in without_masks)]
     points: list[float] = [len(track.newest.cloud) for track in predicted.tracks]
     points += [track.appearance_points for track in without_masks]
     elapsed = torch.tensor([[stamp - track.newest.stamp] for track in tracks], dtype=torch.float64)
