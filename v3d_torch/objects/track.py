@@ -330,8 +330,8 @@ class Track:
         if score > 0 or self.total_score == 0:  # masks of a user can lack scores
             self.labels[label] += 1
         self.total_score += score
-        named = Counter({label: count for label, count in self.labels.items() if label != UNLABELLED})
-        self.label = (named or self.labels).most_common(1)[0][0]
+        named = [label for label in self.labels if label != UNLABELLED]
+        self.label = max(named or self.labels, key=self.labels.__getitem__)
 
     def update_appearance(self, histogram: Tensor) -> None:
         """Update the mean colour histogram.
