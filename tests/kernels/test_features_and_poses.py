@@ -88,22 +88,6 @@ def test_projection_of_a_local_map_equals_its_twin(count: int) -> None:
         assert count < 300 or len(found.indices)
 
 
-@pytest.mark.parametrize("counts", [[0], [3, 0, 500], [1, 1]])
-def test_moved_clouds_equal_their_twin(counts: list[int]) -> None:
-    generator = torch.Generator().manual_seed(0)
-    points, motions = (
-        torch.randn(sum(counts), 3, generator=generator),
-        torch.randn(len(counts), 3, generator=generator).double(),
-    )
-    points[:1] = torch.nan
-    T = se3_exp(torch.tensor([0.1, 0.2, 0.3, 0.1, -0.2, 0.3], dtype=torch.float64))
-    twin = TWINS["v3d_torch.objects.track._transform_moved"]
-    found, expected = (f(points, counts, motions, T) for f in twin)
-    assert found.dtype == torch.float64
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-12, equal_nan=True)
-    assert twin.compiled(points.double(), counts, motions, T) is NotImplemented
-
-
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-5, 1e-3, 0.1, 1.0, 3.1])
 @pytest.mark.parametrize("name", ["invert", "orthonormalise", "se3_exp", "se3_log"])
 def test_single_rigid_motions_equal_their_twins(name: str, scale: float) -> None:

@@ -22,7 +22,7 @@ from v3d_torch.io.files import atomic_write
 
 _FORMAT = "v3d_torch state"
 
-VERSION = 42
+VERSION = 43
 """Version of the content of states. A state of another version is rejected."""
 
 _FIRST_LINE = f"{_FORMAT} {{version}} sha256 {{digest}}\n"

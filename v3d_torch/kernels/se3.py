@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from v3d_torch.kernels import reprojection
-from v3d_torch.kernels.arrays import Floats, Floats32, Ints
+from v3d_torch.kernels.arrays import Floats
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.reprojection import SMALL_ANGLE
 
@@ -30,28 +30,6 @@ def invert(T: Floats) -> Floats:
             inverse[i, j] = T[j, i]
         inverse[i, 3] = 0.0 - (T[0, i] * T[0, 3] + T[1, i] * T[1, 3] + T[2, i] * T[2, 3])
     return inverse
-
-
-@kernel("(f4[:,::1], i8[::1], f8[:,::1], f8[:,::1])")
-def transform_moved(points: Floats32, counts: Ints, motions: Floats, T: Floats) -> Floats:
-    """Translate each of several clouds, and transform all of them into another frame.
-
-    Args:
-        points: Points of the K clouds one after the other, metres, (N, 3).
-        counts: Number of points of each cloud, (K,).
-        motions: Translation of each cloud, metres, (K, 3).
-        T: Transform into the other frame, (4, 4).
-
-    Returns:
-        Points in the other frame, (N, 3).
-    """
-    moved, first = np.empty((len(points), 3)), 0
-    for k in range(len(counts)):
-        for i in range(first, first + counts[k]):
-            x, y, z = points[i, 0] + motions[k, 0], points[i, 1] + motions[k, 1], points[i, 2] + motions[k, 2]
-            moved[i, 0], moved[i, 1], moved[i, 2] = reprojection.transform(T, x, y, z)
-        first += counts[k]
-    return moved
 
 
 @device

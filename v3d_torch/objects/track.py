@@ -8,14 +8,11 @@ from collections.abc import Sequence
 from dataclasses import InitVar, dataclass, field
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from v3d_torch.config import TrackerConfig
 from v3d_torch.geometry.se3 import transform_points
-from v3d_torch.kernels import se3 as kernels
-from v3d_torch.kernels.compiler import compiled_by, to_array
 from v3d_torch.objects.kalman_filter import ConstantVelocityKalmanFilter
 from v3d_torch.objects.log_ratios import vacated_log_ratio
 from v3d_torch.objects.motion_record import MotionRecord
@@ -416,28 +413,5 @@ def predict_clouds(tracks: Sequence[Track], states: Sequence[ObjectState], T_cw:
     clouds = [track.newest.cloud for track in tracks]
     counts = [len(cloud) for cloud in clouds]
     motions = torch.stack([track.motion_to(state) for track, state in zip(tracks, states, strict=True)])
-    return list(_transform_moved(torch.cat(clouds), counts, motions, T_cw).split(counts))
-
-
-def _transform_moved_compiled(points: Tensor, counts: list[int], motions: Tensor, T: Tensor) -> Tensor:
-    if points.dtype != torch.float32:
-        return NotImplemented
-    moved = kernels.transform_moved(to_array(points), np.array(counts, np.int64), to_array(motions), to_array(T))
-    return torch.from_numpy(moved)
-
-
-@compiled_by(_transform_moved_compiled)
-def _transform_moved(points: Tensor, counts: list[int], motions: Tensor, T: Tensor) -> Tensor:
-    """Translate each of several clouds, and transform all of them into another frame.
-
-    Args:
-        points: Points of the K clouds one after the other, metres, shape (N, 3).
-        counts: Number of points of each cloud.
-        motions: Translation of each cloud, metres, float64, shape (K, 3).
-        T: Transform into the other frame, float64, shape (4, 4).
-
-    Returns:
-        Points in the other frame, metres, float64, shape (N, 3).
-    """
-    moved = points.to(torch.float64) + motions.repeat_interleave(torch.tensor(counts), dim=0)
-    return transform_points(T, moved)
+    points = torch.cat(clouds).to(torch.float64) + motions.repeat_interleave(torch.tensor(counts), dim=0)
+    return list(transform_points(T_cw, points).split(counts))
