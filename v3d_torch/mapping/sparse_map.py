@@ -146,7 +146,7 @@ class SparseMap(MapTables):
         table = self.landmarks
         moved = move_landmarks(invert(T_cw) @ previous, table["keyframe"], table["point"], table["direction"])
         for column, values in zip(("point", "direction"), moved, strict=True):
-            table[column].copy_(values)
+            table[column].numpy()[:] = values.numpy()  # the columns can be tensors of inference mode
         for keyframe, pose in zip(self.keyframes, T_cw, strict=True):
             keyframe.T_cw = pose
 
