@@ -82,6 +82,7 @@ SHAPES = {"box": (1.0, 1.0, 1.0), "sheet": (1.0, 2.0, 0.01), "line": (1.0, 0.0, 
     min_samples=st.integers(1, 12),
 )
 @example(seed=0, count=20_000, shape="sheet", lattice=True, min_samples=5)
+@example(seed=8997179, count=2, shape="box", lattice=False, min_samples=1)
 def test_labels_of_random_large_clouds_equal_scikit_learn(
     seed: int, count: int, shape: str, lattice: bool, min_samples: int
 ) -> None:
@@ -89,7 +90,7 @@ def test_labels_of_random_large_clouds_equal_scikit_learn(
     points = generator.random((count, 3)) * SHAPES[shape]
     # With this radius about every second point is a core point: clusters, border points and noise.
     nearest = NearestNeighbors(n_neighbors=min(count, min_samples + 1)).fit(points).kneighbors(points)[0]
-    eps = float(nearest[:, -1].mean()) or 1.0
+    eps = float(nearest[:, -1].mean()) * (1 + 1e-9) or 1.0  # two points would be eps apart, up to rounding errors
     if lattice:  # spacing eps / 2, exact: many points coincide, and many are exactly eps apart
         eps = 2.0 ** np.round(np.log2(eps))
         points = np.round(points * 2 / eps) * eps / 2
