@@ -297,8 +297,7 @@ SECTIONS: dict[str, tuple[Part, ...]] = {
                 " better of two settings is shown. The best HOTA and IDF1 of a sequence are bold. A true velocity is"
                 " the change of the true position over half a second, which ends a quarter of a second after the frame."
                 " From true positions: the error of the velocity that fits those of the last 0.3 s. A true position is"
-                " the mean of the voxels of the visible surface; those of v3d_torch have the same definition from the"
-                " commit 60028936 on, before they were means of pixels."
+                " the mean of the voxels of the visible surface."
             ),
             tracks_table,
             key="sequence",
