@@ -25,7 +25,7 @@ def _min(a: Floats32, b: Floats32, minimum: Floats32) -> None:
 
 
 @device
-def _lower(a: Floats32, minimum: Floats32) -> None:
+def lower(a: Floats32, minimum: Floats32) -> None:
     """Update a minimum in place; in one loop with `_min`, arrays could overlap and would not be vectorised."""
     for x in range(minimum.size):
         minimum[x] = a[x] if a[x] < minimum[x] else minimum[x]
@@ -71,5 +71,5 @@ def nearest_depth(depth: Floats32, radius: int) -> Floats32:
         begin[:] = np.float32(_MAX)
         for i in range(min(size, height - first)):
             _write(end[i], begin, depth[first + i], nearest[first + i])
-            _lower(minima[first + size + i], begin)
+            lower(minima[first + size + i], begin)
     return nearest

@@ -10,6 +10,7 @@ from v3d_torch.kernels.arrays import Bools, Bytes, Floats, Floats32, Ints
 from v3d_torch.kernels.camera import Bounds, Intrinsics, project_to_image
 from v3d_torch.kernels.compiler import device, kernel
 from v3d_torch.kernels.masks import Box
+from v3d_torch.kernels.nearest_depth import lower
 
 
 @device
@@ -60,12 +61,6 @@ def project_to_cells(
     return cells, depths, minima, first, median
 
 
-@device
-def _lower(values: Floats32, minimum: Floats32) -> None:
-    for x in range(minimum.size):
-        minimum[x] = values[x] if values[x] < minimum[x] else minimum[x]
-
-
 @kernel("(f4[:,:,::1], u1[::1], f4)")
 def minima_around(minima: Floats32, heights: Bytes, no_depth: float) -> Floats32:
     """Minima in a convex, symmetric shape around each cell, also around the empty cells beside the given ones.
@@ -89,11 +84,11 @@ def minima_around(minima: Floats32, heights: Bytes, no_depth: float) -> Floats32
     in_column = np.full(around.size + 2 * border, no_depth, np.float32)
     for height in range(radius + 1):
         above, below = (radius - height) * width, (radius + height) * width
-        _lower(values, in_column[border + above : border + above + values.size])
-        _lower(values, in_column[border + below : border + below + values.size])
+        lower(values, in_column[border + above : border + above + values.size])
+        lower(values, in_column[border + below : border + below + values.size])
         for x in range(2 * radius + 1):
             if heights[abs(x - radius)] == height:
-                _lower(in_column[2 * x + above : 2 * x + below + values.size], around[above : below + values.size])
+                lower(in_column[2 * x + above : 2 * x + below + values.size], around[above : below + values.size])
     return around.reshape(rows + 2 * radius, columns + 2 * radius, 2)
 
 

@@ -42,7 +42,7 @@ def static_masks(
     covered = np.zeros(size, np.bool_)
     _add(excluded, covered)
     static_mask = _outside(covered, config.dilation)
-    _add([each for each in all_masks if not any(each is other for other in excluded)], covered)
+    _add(all_masks, covered)
     return StaticMasks(static_mask, static_mask & _outside(covered, config.map_dilation))
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from v3d_torch.geometry.camera import PinholeCamera
-from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks
+from v3d_torch.geometry.packed_masks import count_common_pixels, count_pixels, pack_masks, unpack_mask
 from v3d_torch.objects.appeared_pixels import MIN_REGION_SIDE, AppearedPixels
 from v3d_torch.objects.motion_evidence import MOVED_FRACTION
 from v3d_torch.objects.resampling import upsample_nearest
@@ -77,4 +77,4 @@ def _accounted_pixels(labels: Tensor, packed: Tensor, appeared: NDArray[np.uint8
     is_rigid = torch.tensor([label in RIGID for label in labels.tolist()], dtype=torch.bool)
     accounts = ~is_rigid | (new >= MOVED_FRACTION * count_pixels(packed))
     accounted = np.bitwise_or.reduce(packed[accounts].numpy(), axis=0)
-    return np.unpackbits(accounted, count=appeared.size).reshape(appeared.shape)
+    return unpack_mask(torch.from_numpy(accounted), appeared.shape).view(torch.uint8).numpy()
